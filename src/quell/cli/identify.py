@@ -28,13 +28,7 @@ from quell.cli.options import (
 from quell.cli.output import Console, check_outputs, print_line, table, write_results
 
 if TYPE_CHECKING:
-    from quell.identification import (
-        Alternative,
-        FrequencyTable,
-        Identified,
-        InputGain,
-        Measured,
-    )
+    from quell.identification import Alternative, FrequencyTable, Identified, InputGain, Measured
 
 # ---- quell identify ----
 

@@ -29,21 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.allocation import (
-    ActuatorLimits,
-    ConstantGain,
-    FunctionGain,
-    Gain,
-    GainMemory,
-    RangeMemory,
-    apply_to_axes,
-    changed_actuator_limits,
-    checked_actuator_limits,
-    checked_gain,
-    checked_rule,
-    range_memory,
-    update_gain,
-)
+from quell.controllers import allocation, given_controls, safe_axes
+from quell.controllers.allocation import apply_to_axes, update_gain
 from quell.controllers.axes_learning import (
     LearningOfAxes,
     learn_of_all,
@@ -80,11 +67,6 @@ from quell.controllers.each_axis import (
 from quell.controllers.given_controls import (
     ANY_CUT,
     allocate_given,
-    check_axes,
-    check_compensates,
-    checked_drives,
-    given_design,
-    given_memory,
     reset_given,
     start_given,
     take_references,
@@ -92,12 +74,7 @@ from quell.controllers.given_controls import (
     write_given,
 )
 from quell.controllers.memory import Layout
-from quell.controllers.safe_axes import (
-    check_safe_sets,
-    keep_in_bands,
-    safe_axes_design,
-    safe_axes_memory,
-)
+from quell.controllers.safe_axes import keep_in_bands
 from quell.controllers.several import (
     control_all,
     motion_by,
@@ -139,7 +116,7 @@ class AxesDesign(NamedTuple):
     axes: tuple[Any, ...]  # of each axis
     gain: Any  # B0
     rule: Any  # what is done at the limits
-    limits: ActuatorLimits
+    limits: allocation.ActuatorLimits
     learning: Any  # of learners that see all axes, see ``axes_learning``
     widths: Any  # channels of each axis (n,), integers
     derivatives: Any  # derivatives of the reference of each axis (n,), integers
@@ -157,8 +134,8 @@ class AxesState(NamedTuple):
 
     axes: tuple[Any, ...]  # of each axis
     learning: Any
-    gain: GainMemory
-    range: RangeMemory
+    gain: allocation.GainMemory
+    range: allocation.RangeMemory
     safe: Any
     given: Any
     loop: NDArray[AxesLoop]  # (1,)
@@ -413,19 +390,23 @@ class Axes(StatefulController):
         parts = [axis for axis, _ in pairs]
         self.prefilters = tuple(prefilter for _, prefilter in pairs)
         self.names = tuple(given) or tuple(f"axis{i + 1}" for i in range(len(parts)))
-        check_axes(parts, self.names)
+        given_controls.check_axes(parts, self.names)
         self.axes: tuple[Any, ...] = tuple(copy.copy(axis) for axis in parts)
         self.B0, self.M, self.weights = B0, M, weights
         self._gain = self._checked_gain()
-        if self._gain.first.shape == (1, 1) and isinstance(self._gain.design, ConstantGain):
+        if self._gain.first.shape == (1, 1) and isinstance(
+            self._gain.design, allocation.ConstantGain
+        ):
             # The gain of one actuator is the b0 of its axis, which has the bits of that ADRC then.
             self._moved = float(self._gain.first[0, 0])
             self.axes = (self.axes[0].with_b0(float(self.first_gain[0, 0])),)
             self._gain = self._checked_gain()
-        check_compensates(self.compensates, drives, wished)
-        self._rule = checked_rule(saturation, wished, self._gain, self.names)
-        self.drives = checked_drives(drives, self.names, self.inputs, self.dt)
-        self._actuators = checked_actuator_limits(u_min, u_max, rate_limit, self.inputs, self.dt)
+        given_controls.check_compensates(self.compensates, drives, wished)
+        self._rule = allocation.checked_rule(saturation, wished, self._gain, self.names)
+        self.drives = given_controls.checked_drives(drives, self.names, self.inputs, self.dt)
+        self._actuators = allocation.checked_actuator_limits(
+            u_min, u_max, rate_limit, self.inputs, self.dt
+        )
         self._check_safe_sets(self._actuators)
         self.learning = LearningOfAxes(learner, guard, self.axes, self.names)
         self.learning.attach(self.axes)
@@ -486,9 +467,9 @@ class Axes(StatefulController):
     def _has_bands(self) -> bool:
         return any(axis.safe_set is not None for axis in self.axes)
 
-    def _checked_gain(self) -> Gain:
+    def _checked_gain(self) -> allocation.Gain:
         given = (self.B0, self.M, self.weights, self.names, self._most)
-        return checked_gain(*given, weighs_change=self._has_bands, b0=self.b0)
+        return allocation.checked_gain(*given, weighs_change=self._has_bands, b0=self.b0)
 
     @property
     def derivatives(self) -> tuple[int, ...]:
@@ -524,14 +505,14 @@ class Axes(StatefulController):
         """Limits of the actuators (m,): ``low``, ``high``, and the largest changes in a sample."""
         return self._actuators
 
-    def _check_safe_sets(self, limits: ActuatorLimits) -> None:
+    def _check_safe_sets(self, limits: allocation.ActuatorLimits) -> None:
         safe_sets = [axis.safe_set for axis in self.axes]
-        check_safe_sets(safe_sets, self.names, self._gain.first, limits)
+        safe_axes.check_safe_sets(safe_sets, self.names, self._gain.first, limits)
 
     def _update_parameters(self) -> None:
         widths = [sum(width for _, width in axis.channels) for axis in self.axes]
         given: Any = (
-            given_design(self.drives)
+            given_controls.given_design(self.drives)
             if self.compensates
             else shaped_design(self.prefilters, self.dt)
         )
@@ -543,11 +524,11 @@ class Axes(StatefulController):
             self.learning.design(self.dt),
             np.array(widths, dtype=np.int64),
             np.array(self._own_derivatives, dtype=np.int64),
-            safe_axes_design([axis.safe_set for axis in self.axes], self._gain.weights),
+            safe_axes.safe_axes_design([axis.safe_set for axis in self.axes], self._gain.weights),
             given,
             learns_of_all=self.learning.learns,
             has_bands=self._has_bands,
-            gain_moves=isinstance(self._gain.design, FunctionGain),
+            gain_moves=isinstance(self._gain.design, allocation.FunctionGain),
             takes_controls=self.compensates,
         )
 
@@ -555,7 +536,7 @@ class Axes(StatefulController):
         """Return a state before the first sample, with nothing learned."""
         n, m = self._gain.shape
         given: Any = (
-            given_memory(self.drives, n, m)
+            given_controls.given_memory(self.drives, n, m)
             if self.compensates
             else shaped_memory(self.parameters.given, self.prefilters, self.axes)
         )
@@ -563,8 +544,8 @@ class Axes(StatefulController):
             axes=tuple(axis.initial_state() for axis in self.axes),
             learning=self.learning.memory(self.parameters.learning),
             gain=self._gain.memory(),
-            range=range_memory(n, m, self._rule),
-            safe=safe_axes_memory(self.parameters.safe, n, m),
+            range=allocation.range_memory(n, m, self._rule),
+            safe=safe_axes.safe_axes_memory(self.parameters.safe, n, m),
             given=given,
             loop=AxesLoop.zeros(),
             x=np.zeros((n, self._most)),
@@ -732,7 +713,7 @@ class Axes(StatefulController):
         ``ValueError`` as for new ``Axes``; then the limits are unchanged.
         """
         given = (u_min, u_max, rate_limit)
-        new = changed_actuator_limits(self._actuators, *given, self.inputs, self.dt)
+        new = allocation.changed_actuator_limits(self._actuators, *given, self.inputs, self.dt)
         self._check_safe_sets(new)
         self._actuators = new
         self._update_parameters()

@@ -35,13 +35,7 @@ import numpy as np
 from quell import checks
 from quell.lti.models import zero_order_hold
 from quell.lti.zeros import fitting_matrices
-from quell.observers.gains import (
-    kalman_gain_of,
-    place_equal_poles,
-    predicted_covariances,
-    settle,
-    units_of,
-)
+from quell.observers import gains
 from quell.types import Matrix
 
 # An equation that is left with more than this share of its terms has no solution. Chosen by hand.
@@ -99,7 +93,7 @@ def regulator(A: Any, B: Any, C: Any, E: Any, disturbance_order: int = 1) -> Reg
         found = []
         for wanted, name in zip(np.vstack([of_state, of_output]).T, names, strict=True):
             whole = np.block([[A, B], [C, np.zeros((outputs, m))]])
-            solution = settle(
+            solution = gains.settle(
                 [
                     (whole * rows[:, None], wanted * rows),
                     (np.eye(n + m)[n:], np.zeros(m)),
@@ -156,10 +150,10 @@ def state_feedback(A: Any, B: Any, omega_c: float, dt: float) -> Matrix:
     """
     A, B, _, _ = fitting_matrices(A, B, np.eye(np.shape(A)[0]))
     omega, dt = checks.positive("omega_c", omega_c, "rad/s"), checks.positive("dt", dt, "s")
-    units = units_of(A.T, B.T, omega)
+    units = gains.units_of(A.T, B.T, omega)
     scaled = A / units[None, :] * units[:, None]
     _, (difference, inputs) = zero_order_hold(scaled, [scaled, B * units[:, None]], dt)
-    gain = place_equal_poles(difference.T, inputs.T, -math.expm1(-omega * dt))
+    gain = gains.place_equal_poles(difference.T, inputs.T, -math.expm1(-omega * dt))
     if gain is None:
         raise ValueError(
             f"omega_c = {omega_c!r} rad/s with dt = {dt!r} s: the poles can not be placed; u must "
@@ -205,17 +199,17 @@ def quadratic_feedback(A: Any, B: Any, state_weight: Any, control_weight: Any, d
     if not np.all(R > 0.0):
         raise ValueError(f"control_weight = {control_weight!r}: each entry must be above zero")
     phi, (gamma,) = zero_order_hold(A, [B], dt)
-    units = units_of(A.T, B.T / np.sqrt(R)[:, None], 0.1 / dt)
+    units = gains.units_of(A.T, B.T / np.sqrt(R)[:, None], 0.1 / dt)
     transition, inputs = phi.T * units[None, :] / units[:, None], gamma.T * units[None, :]
     cost = Q / (units[:, None] * units[None, :])
-    found = predicted_covariances(transition, cost, inputs, R, np.ones((1, m)))
+    found = gains.predicted_covariances(transition, cost, inputs, R, np.ones((1, m)))
     if found is None:
         raise ValueError(
             f"control_weight = {R.tolist()!r} with dt = {dt!r} s: no gain is stable and has the "
             "least cost; u must move all states that do not decay, and state_weight must see them"
         )
     # The filter's gain L corrects after the prediction; the law acts before it: K = (Φᵀ L)ᵀ.
-    gain = transition @ kalman_gain_of(found[0], inputs, R, np.ones(m, dtype=bool))
+    gain = transition @ gains.kalman_gain_of(found[0], inputs, R, np.ones(m, dtype=bool))
     law: Matrix = (gain * units[:, None]).T
     return law
 

@@ -42,16 +42,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quell import checks
-from quell.controllers.schedule import (
-    Point,
-    Schedule,
-    check_b0_of,
-    control_as_observed,
-    follow_signals,
-    forget_signals,
-    gain_in_use,
-    known_with_schedule,
-)
+from quell.controllers import schedule
 from quell.kernels.dispatch import is_finite, kernel
 from quell.kernels.functions import sqrt
 from quell.kernels.sized import Flag, Scalars, Size
@@ -118,19 +109,19 @@ class OnlineMemory(NamedTuple):
     loop: NDArray[OnlineLoop]  # (1,)
 
 
-@gain_in_use.register(OnlineDesign)
+@schedule.gain_in_use.register(OnlineDesign)
 def _gain_in_use(design: OnlineDesign, memory: OnlineMemory, b0: float) -> float:
     return memory.loop[0].b0
 
 
-@control_as_observed.register(OnlineDesign)
+@schedule.control_as_observed.register(OnlineDesign)
 def _as_observed(design: OnlineDesign, memory: OnlineMemory, u: float) -> float:
     if design.is_delayed:
         return u
     return u * (memory.loop[0].b0 * design.inverse_b0)
 
 
-@known_with_schedule.register(OnlineDesign)
+@schedule.known_with_schedule.register(OnlineDesign)
 def _known(design: OnlineDesign, memory: OnlineMemory, known: float, b0: float, u: float) -> float:
     if design.is_delayed:
         return known + (memory.loop[0].b0 - b0) * u
@@ -155,7 +146,7 @@ def _moves(design: OnlineDesign, own: Any, energy: float) -> bool:
     return energy > _NOTHING * own.peak
 
 
-@follow_signals.register(OnlineDesign)
+@schedule.follow_signals.register(OnlineDesign)
 def _follow(
     design: OnlineDesign, memory: OnlineMemory, loop: Any, z: Vector, estimates: Vector,
     reference: Vector, at_f: int, u: float, continues: bool, safe_set: Any, set_memory: Any,
@@ -220,7 +211,7 @@ def _sign(design: OnlineDesign) -> float:
     return 1.0 if design.inverse_b0 > 0.0 else -1.0
 
 
-@forget_signals.register(OnlineDesign)
+@schedule.forget_signals.register(OnlineDesign)
 def _forget_motion(design: OnlineDesign, memory: OnlineMemory, b0: float) -> None:
     memory.loop[0].found = 0.0
     for i in range(4):
@@ -310,11 +301,11 @@ class OnlineGain:
         ends = abs(self.low), abs(self.high)
         return max(ends) / min(ends)
 
-    def at(self, values: Sequence[float], base: Point) -> Point:
+    def at(self, values: Sequence[float], base: schedule.Point) -> schedule.Point:
         """Return the gains for a b0, of which one outside of the limits is at the end."""
         return base._replace(b0=float(min(max(values[0], self.low), self.high)))
 
-    check_retuning = Schedule.check_retuning
+    check_retuning = schedule.Schedule.check_retuning
 
     def design(
         self, observer: ESO, omega_c: float, law: Callable[[float], Vector] | None
@@ -326,7 +317,7 @@ class OnlineGain:
                 f"schedule = OnlineGain(...): the observer is of order {n}; the estimate is for "
                 "plants of order 1 and 2, and a table (Schedule) for any"
             )
-        check_b0_of(observer)
+        schedule.check_b0_of(observer)
         if not self.low <= observer.b0 <= self.high:
             raise ValueError(
                 f"schedule: b0 = {observer.b0!r} of the observer is outside of low = {self.low!r} "

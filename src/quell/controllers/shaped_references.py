@@ -14,16 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quell.controllers import given_controls
 from quell.controllers.allocation import GainMemory
 from quell.controllers.base import is_usable
-from quell.controllers.given_controls import (
-    NoGivenMemory,
-    References,
-    reset_given,
-    start_given,
-    take_references,
-    write_given,
-)
 from quell.controllers.prefilters import (
     Prefiltered,
     PrefilteredLoop,
@@ -155,7 +148,7 @@ def stop_of_moves(design: Any, state: Any, r: Vector) -> None:
     _stop_all(design.given.shapers, state.given.shapers, state.given.r, r)
 
 
-@take_references.register(ShapedReferences)
+@given_controls.take_references.register(ShapedReferences)
 def _take_references(
     given: ShapedReferences,
     memory: ShapedMemory,
@@ -169,7 +162,7 @@ def _take_references(
     return _shape_all(given.shapers, memory.shapers, axes, states, 0, r, y, wish, memory.r)
 
 
-@start_given.register(ShapedReferences)
+@given_controls.start_given.register(ShapedReferences)
 def _start_given(
     given: ShapedReferences,
     memory: ShapedMemory,
@@ -184,14 +177,14 @@ def _start_given(
         wish[i] = r[i]
 
 
-@reset_given.register(ShapedReferences)
+@given_controls.reset_given.register(ShapedReferences)
 def _reset_given(given: ShapedReferences, memory: ShapedMemory) -> None:
     _reset_all(given.shapers, memory.shapers)
     for i in range(memory.r.size):
         memory.r[i] = 0.0
 
 
-@write_given.register(ShapedReferences)
+@given_controls.write_given.register(ShapedReferences)
 def _write_given(given: ShapedReferences, memory: ShapedMemory, at: int, row: Vector) -> None:
     for i in range(memory.r.size):
         row[at + i] = memory.r[i]
@@ -215,21 +208,25 @@ def are_shaped(prefilters: Sequence[Any]) -> bool:
     return any(each is not None for each in prefilters)
 
 
-def shaped_design(prefilters: Sequence[Any], dt: float) -> ShapedReferences | References:
+def shaped_design(
+    prefilters: Sequence[Any], dt: float
+) -> ShapedReferences | given_controls.References:
     """Return the parameters of the prefilters of the axes; ``References`` without any."""
     if not are_shaped(prefilters):
-        return References()
+        return given_controls.References()
     return ShapedReferences(
         tuple(NoPrefilter() if p is None else AxisPrefilter(p.design(dt)) for p in prefilters)
     )
 
 
 def shaped_memory(
-    design: ShapedReferences | References, prefilters: Sequence[Any], axes: Sequence[Any]
-) -> ShapedMemory | NoGivenMemory:
+    design: ShapedReferences | given_controls.References,
+    prefilters: Sequence[Any],
+    axes: Sequence[Any],
+) -> ShapedMemory | given_controls.NoGivenMemory:
     """Return the state before the first sample."""
-    if isinstance(design, References):
-        return NoGivenMemory(np.zeros(0))
+    if isinstance(design, given_controls.References):
+        return given_controls.NoGivenMemory(np.zeros(0))
     parts: list[Any] = []
     for part, prefilter, axis in zip(design.shapers, prefilters, axes, strict=True):
         if prefilter is None:

@@ -52,13 +52,8 @@ from quell.plants.base import (
     outputs_of,
 )
 from quell.records.record import columns_of
-from quell.simulation.driver import (
-    Sample,
-    logged_channels,
-    run_samples,
-    sample_of,
-    width_of_signals,
-)
+from quell.simulation import driver
+from quell.simulation.driver import run_samples
 from quell.simulation.scenario import SampledScenario, Scenario, check_scenario, is_random
 from quell.types import Channels, Matrix, Vector
 
@@ -239,7 +234,7 @@ class Lane(NamedTuple):
     x: Vector  # state of the plant (n,)
     scratch: Vector  # (6 n,), see ``plants.base.advance``
     controller: Any  # state of the controller
-    sample: Sample  # work space
+    sample: driver.Sample  # work space
 
 
 class Step(NamedTuple):
@@ -430,7 +425,7 @@ class Loops:
             worst=4.0 * self.limit**2 * float(np.sum(self.weights)) + cost * u_most**2,
             derivatives=len(example.derivatives),
         )
-        self.channels: Channels = logged_channels(plant, controller)
+        self.channels: Channels = driver.logged_channels(plant, controller)
         self._as_python = interpret or dispatch.interpret_all or not plant.compiled
         models = [p.sampled(controller.dt, interpret) for p in (each or [plant])]
         self._models, self._plant_stride = models, int(len(models) > 1)
@@ -467,7 +462,7 @@ class Loops:
             sample=np.zeros(count, np.int64),
             status=np.zeros(count, np.int64),
             diverged=np.zeros(count, np.int64),
-            log=np.zeros((count, repeat, width_of_signals(self.plant, self.controller))),
+            log=np.zeros((count, repeat, driver.width_of_signals(self.plant, self.controller))),
         )
 
     def _everywhere(self, first: Vector) -> NDArray[np.float64]:
@@ -485,7 +480,9 @@ class Loops:
     def _at_rest(self) -> Lane:
         n = self.plant.order
         state = self.controller.initial_state()
-        return Lane(np.zeros(n), np.zeros(6 * n), state, sample_of(self.plant, self.controller))
+        return Lane(
+            np.zeros(n), np.zeros(6 * n), state, driver.sample_of(self.plant, self.controller)
+        )
 
     def reset(self, which: Sequence[int], rngs: Sequence[np.random.Generator]) -> None:
         """Begin an episode in some loops, drawn from the generator of each."""

@@ -14,13 +14,7 @@ from quell import checks
 from quell.checks import text
 from quell.hints import explained
 from quell.lti.canonical import Canonical, canonical, format_roots, without_far_zeros
-from quell.observers.design import (
-    checked_disturbance_order,
-    design_model,
-    kalman_gain,
-    scaled_response,
-    total_time_constant,
-)
+from quell.observers import design
 from quell.observers.forms import (
     DelayedModel,
     EsoModel,
@@ -326,9 +320,9 @@ class ESO:
         drift, jitter = checks.positive("drift", drift), checks.non_negative("jitter", jitter)
         dt = checks.positive("dt", dt, "s")
         checks.one_of("form", form, ("current", "predictor"))
-        m = checked_disturbance_order(disturbance_order)
+        m = design.checked_disturbance_order(disturbance_order)
         chain = np.diag(np.ones(n + m - 1), 1)
-        gain, omega_o = kalman_gain(chain, n, dt, noise, drift, jitter)
+        gain, omega_o = design.kalman_gain(chain, n, dt, noise, drift, jitter)
         observer = cls.model_free(n, b0, omega_o, dt, form=form, disturbance_order=m)
         return observer._with_model(observer.model._replace(gain=gain), delay)
 
@@ -455,11 +449,11 @@ class ESO:
         b0 = checks.nonzero("b0", b0, reason)
         omega_o, dt = checks.positive("omega_o", omega_o, "rad/s"), checks.positive("dt", dt, "s")
         options: dict[str, Any] = {"half_gain": half_gain, "keep_zeros": keep_zeros}
-        m = options["disturbance_order"] = checked_disturbance_order(
+        m = options["disturbance_order"] = design.checked_disturbance_order(
             disturbance_order, frequencies, dt
         )
         options["frequencies"] = known = tuple(map(float, frequencies))
-        model = design_model(plant, b0, omega_o, dt, form=form, poles=poles, **options)
+        model = design.design_model(plant, b0, omega_o, dt, form=form, poles=poles, **options)
         has_one_pole = form != "reduced" and not half_gain and poles is None
         model = delayed_model(model, delay, dt)
         return cls(plant, b0, omega_o, dt, form, model, has_one_pole, poles, m, known)
@@ -541,7 +535,9 @@ class ESO:
         """
         if self.has_one_pole or isinstance(without_delay(self.model), NonlinearModel):
             return self.estimates / self.omega_o
-        return self.dt * total_time_constant(scaled_response(self.model, self.units, self.order))
+        return self.dt * design.total_time_constant(
+            design.scaled_response(self.model, self.units, self.order)
+        )
 
     @property
     def pole(self) -> float:
@@ -616,7 +612,7 @@ def _unit_noise_gains(size: int) -> Vector:
 
 def _summed_noise_gains(observer: ESO) -> Vector:
     """Return the diagonal of ``C P Cᵀ + d dᵀ``, ``P = Σ M^k g gᵀ M^kᵀ``, by doubling."""
-    found = scaled_response(observer.model, observer.units, observer.order)
+    found = design.scaled_response(observer.model, observer.units, observer.order)
     gain, feedthrough, transition = found.input[:, 0], found.feedthrough[:, 0], found.transition
     total = np.outer(gain, gain)
     for _ in range(64):
@@ -650,7 +646,7 @@ def redesign(observer: ESO) -> Callable[[float], Vector]:
         how |= {"poles": observer.poles, "disturbance_order": observer.disturbance_order}
         how["frequencies"] = observer.frequencies
         plant, b0, dt = observer.plant, observer.b0, observer.dt
-        return design_model(plant, b0, omega_o, dt, keep_zeros=False, **how).gain
+        return design.design_model(plant, b0, omega_o, dt, keep_zeros=False, **how).gain
 
     for half in (False, True):
         if np.allclose(gain(observer.omega_o, half), model.gain, rtol=1e-9, atol=0.0):

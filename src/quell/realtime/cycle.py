@@ -58,7 +58,7 @@ from quell.kernels.dispatch import (
     specialised,
 )
 from quell.kernels.sized import Size
-from quell.realtime import recordings
+from quell.realtime import devices, recordings, system
 from quell.realtime.channels import (
     ChannelInputs,
     channel_inputs,
@@ -67,12 +67,9 @@ from quell.realtime.channels import (
     record_channels,
 )
 from quell.realtime.devices import (
-    Device,
-    PythonHandle,
     Tick,
     ask,
     drop_signals,
-    handle_of,
     read_acting,
     read_measurement,
     read_signals,
@@ -98,16 +95,7 @@ from quell.realtime.supervisor import (
     supervise_controls,
     update_mode,
 )
-from quell.realtime.system import (
-    Histogram,
-    Timing,
-    count_duration,
-    empty_counts,
-    load_acquire,
-    now,
-    store_release,
-    wait_until,
-)
+from quell.realtime.system import count_duration, load_acquire, now, store_release, wait_until
 from quell.realtime.telemetry import Ring, push
 from quell.records.record import columns_of
 from quell.types import Channels, Vector
@@ -605,8 +593,8 @@ def supervise(
             row=row,
             channels=row.size - len(channels),
             controller=sum(width for _, width in loop_channels(*counts)),
-            lateness=empty_counts(),
-            step_time=empty_counts(),
+            lateness=system.empty_counts(),
+            step_time=system.empty_counts(),
         ),
         inputs=channel_inputs(controller, channels),
         f_hat=np.array([_places_of_f(columns, each) for each in before]),
@@ -631,7 +619,7 @@ class ControlLoop:
     @classmethod
     def of(
         cls,
-        device: Device,
+        device: devices.Device,
         controller: Any,
         reference: Any,
         rules: Rules,
@@ -648,8 +636,8 @@ class ControlLoop:
         of the device, as ``checked_channels`` returns them.
         """
         supervised = supervise(controller, reference, rules, ring, channels, state)
-        handle = handle_of(device)
-        paced = getattr(device, "paced", False) and not isinstance(handle, PythonHandle)
+        handle = devices.handle_of(device)
+        paced = getattr(device, "paced", False) and not isinstance(handle, devices.PythonHandle)
         loop = cls(handle, clock, controller.dt * 1e9, supervised, paced, interpret)
         loop._compile()
         return loop
@@ -657,13 +645,13 @@ class ControlLoop:
     @property
     def interpreted(self) -> bool:
         """Whether the loop runs as plain Python."""
-        return self.interpret or isinstance(self.handle, PythonHandle)
+        return self.interpret or isinstance(self.handle, devices.PythonHandle)
 
     @property
-    def timing(self) -> Timing:
+    def timing(self) -> system.Timing:
         """Punctuality so far."""
         log = self.controller.log
-        return Timing(Histogram.of(log.lateness), Histogram.of(log.step_time))
+        return system.Timing(system.Histogram.of(log.lateness), system.Histogram.of(log.step_time))
 
     def run(self) -> None:
         """Run all cycles."""

@@ -51,38 +51,11 @@ from quell.controllers.compensated import takes_control
 from quell.controllers.compensator import Compensator
 from quell.kernels.dispatch import is_finite, kernel
 from quell.plants.base import advance, all_signals, as_input, measure_all
+from quell.realtime import cycle, devices, rig
 from quell.realtime.channels import await_channels, checked_channels
-from quell.realtime.cycle import (
-    SupervisedController,
-    control_step,
-    count_cycle,
-    count_fault,
-    first_of,
-    samples_of,
-    set_references,
-    supervise,
-    take_inputs,
-)
-from quell.realtime.devices import (
-    Device,
-    PythonHandle,
-    check_counts,
-    counts_of,
-    handle_of,
-    read_measurement,
-    write_signals,
-)
-from quell.realtime.rig import (
-    BEHIND,
-    LIVE,
-    STATE,
-    TRIPPED,
-    fill_log,
-    has_ended,
-    may_end,
-    measure_channels,
-    tell_host,
-)
+from quell.realtime.cycle import control_step, count_cycle, count_fault, take_inputs
+from quell.realtime.devices import read_measurement, write_signals
+from quell.realtime.rig import BEHIND, LIVE, STATE, TRIPPED
 from quell.realtime.run import ModeChange, mode_changes, signal_name
 from quell.realtime.safety import Safety
 from quell.realtime.supervisor import (
@@ -120,17 +93,17 @@ class HostCommand(NamedTuple):
     given: Vector  # u_0 of this tick (m,)
 
 
-@samples_of.register(HostCommand)
+@cycle.samples_of.register(HostCommand)
 def _samples(reference: HostCommand) -> int:
     return _NEVER
 
 
-@first_of.register(HostCommand)
+@cycle.first_of.register(HostCommand)
 def _first(reference: HostCommand, i: int) -> float:
     return 0.0
 
 
-@set_references.register(HostCommand)
+@cycle.set_references.register(HostCommand)
 def _set_commands(
     reference: HostCommand, design: Any, state: Any, memory: Memory, signals: LoopSignals, k: int
 ) -> None:
@@ -154,7 +127,7 @@ class ProxyDesign(NamedTuple):
 
     handle: Any  # of the device
     clock: Any
-    controller: SupervisedController
+    controller: cycle.SupervisedController
     drive: Drive
 
 
@@ -197,13 +170,13 @@ def _measure_all(proxy: ProxyDesign, x: Vector, y: Vector) -> None:
     _hide_channels(proxy)
 
 
-@measure_channels.register(ProxyDesign)
+@rig.measure_channels.register(ProxyDesign)
 def _measure_channels(proxy: ProxyDesign, x: Vector, values: Vector) -> None:
     for i in range(values.size):
         values[i] = proxy.controller.inputs.values[i]
 
 
-@tell_host.register(ProxyDesign)
+@rig.tell_host.register(ProxyDesign)
 def _tell(proxy: ProxyDesign, counts: NDArray[np.int64], session: int) -> None:
     memory, own = proxy.controller.supervisor.memory[0], proxy.drive.counts
     if memory.mode == Mode.START:
@@ -245,13 +218,13 @@ def _advance(
     drive.counts[_TICK] = k + 1
 
 
-@has_ended.register(ProxyDesign)
+@rig.has_ended.register(ProxyDesign)
 def _has_ended(proxy: ProxyDesign) -> bool:
     supervisor = proxy.controller.supervisor
     return finished(supervisor) and supervisor.memory[0].ended_by != Cause.HOST_LEFT
 
 
-@may_end.register(ProxyDesign)
+@rig.may_end.register(ProxyDesign)
 def _may_end(proxy: ProxyDesign, stop: int) -> bool:
     supervisor = proxy.controller.supervisor
     asked = Request.RAMP if stop < 2 else Request.ZERO
@@ -260,7 +233,7 @@ def _may_end(proxy: ProxyDesign, stop: int) -> bool:
     return finished(supervisor)
 
 
-@fill_log.register(ProxyDesign)
+@rig.fill_log.register(ProxyDesign)
 def _fill_log(proxy: ProxyDesign, row: Vector) -> None:
     supervisor = proxy.controller.supervisor
     row[0] = supervisor.memory[0].mode
@@ -311,7 +284,7 @@ class CompensatedDrive:
 
     def __init__(
         self,
-        device: Device,
+        device: devices.Device,
         compensator: Compensator | Axes,
         *,
         channels: Sequence[str] = (),
@@ -336,8 +309,8 @@ class CompensatedDrive:
                 "reference; leave it out, and give y_min and y_max where the plant must not go"
             )
         self.rules = safety.rules(compensator)
-        check_counts(device, counts_of(compensator))
-        outputs, inputs = counts_of(compensator) or (1, 1)
+        devices.check_counts(device, devices.counts_of(compensator))
+        outputs, inputs = devices.counts_of(compensator) or (1, 1)
         self.log_columns: tuple[str, ...] = ("mode", "u_drive")
         if axes is not None:  # a plant with several signals has these attributes
             self.outputs, self.inputs = outputs, inputs
@@ -348,8 +321,8 @@ class CompensatedDrive:
                 f"device has dt = {own!r} s, the compensator {compensator.dt!r} s: must be the same"
             )
         self.device, self.compensator = device, compensator
-        self._handle = handle_of(device)
-        if isinstance(self._handle, PythonHandle):
+        self._handle = devices.handle_of(device)
+        if isinstance(self._handle, devices.PythonHandle):
             raise ValueError(
                 f"device = {device!r}: must be one that compiled code can use, such as udp:// or "
                 "serial://"
@@ -357,7 +330,7 @@ class CompensatedDrive:
         self._state = compensator.initial_state()
         command = HostCommand(np.zeros(inputs))
         parts = (compensator, command, self.rules, ring(1, 1), self.channels, self._state)
-        self._controller = supervise(*parts)
+        self._controller = cycle.supervise(*parts)
         # The drive's clock is not the proxy's: good samples in a row may never be many.
         self._supervisor.memory[0].forgiven = self._controller.rules.hold
         self._drive = Drive(

@@ -58,22 +58,9 @@ from quell import checks
 from quell.files import GrowingFile, check_writable
 from quell.kernels.dispatch import call_specialised, compiled, generic_with_default, kernel
 from quell.plants.base import Plant, advance, as_input, check_plant, is_destroyed, measure_all
-from quell.realtime import wire
+from quell.realtime import system, wire
 from quell.realtime.devices import Listener, counts_of
-from quell.realtime.system import (
-    Histogram,
-    checked_cpu,
-    checked_priority,
-    count_duration,
-    empty_counts,
-    enter_real_time,
-    load_acquire,
-    now,
-    real_time_process,
-    store_release,
-    system_clock,
-    wait_until,
-)
+from quell.realtime.system import count_duration, load_acquire, now, wait_until
 from quell.realtime.telemetry import Ring, drain, dropped, push, ring
 from quell.realtime.wire import (
     MOST_AT_ONCE,
@@ -571,12 +558,12 @@ class Rig:
             row=np.zeros(len(self._columns)),
             log=ring(1 if log is None else rows, len(self._columns)),
             logged=log is not None,
-            lateness=empty_counts(),
+            lateness=system.empty_counts(),
             stop=np.zeros(1, dtype=np.int64),
         )
         self._file = None if log is None else _opened(log, overwrite, self._columns)
         self._log_failure, self._lost = "", 0
-        self._clock = system_clock()
+        self._clock = system.system_clock()
         self._open = True
 
     @property
@@ -611,9 +598,9 @@ class Rig:
         return float(np.max(self.model.signals[LARGEST]))
 
     @property
-    def lateness(self) -> Histogram:
+    def lateness(self) -> system.Histogram:
         """Lateness of the ticks in ``run`` [s]."""
-        return Histogram.of(self.model.lateness)
+        return system.Histogram.of(self.model.lateness)
 
     @property
     def unlogged(self) -> int:
@@ -662,14 +649,14 @@ class Rig:
         most = -1
         if seconds is not None:
             most = max(round(checked_seconds("seconds", seconds) / self.dt), 1)
-        priority, cpu = checked_priority(priority), checked_cpu(cpu)
+        priority, cpu = system.checked_priority(priority), system.checked_cpu(cpu)
         self.prepare()
         raised: list[BaseException] = []
-        with real_time_process(priority, False) as notes:
+        with system.real_time_process(priority, False) as notes:
 
             def work() -> None:
                 try:
-                    enter_real_time(priority, cpu, notes)
+                    system.enter_real_time(priority, cpu, notes)
                     self._serve(most, True)
                     self._end_session()  # at once: the loop holds u while it waits for measurements
                 except BaseException as error:
@@ -695,7 +682,7 @@ class Rig:
 
     def stop(self) -> None:
         """End ``run`` at its next tick; a second call does not wait for a ramp of u."""
-        store_release(self.model.stop, 0, int(self.model.stop[0]) + 1)
+        system.store_release(self.model.stop, 0, int(self.model.stop[0]) + 1)
 
     def close(self) -> None:
         """End the session, if there is one, and release the wire; a second call does nothing."""

@@ -42,24 +42,10 @@ from numpy.typing import NDArray
 
 from quell.checks import import_extra
 from quell.kernels.dispatch import kernel
+from quell.realtime import wire
 from quell.realtime.authenticated import authenticated, read_key
 from quell.realtime.system import external
-from quell.realtime.wire import (
-    LENGTH,
-    MOST_SIGNALS,
-    Buffer,
-    Descriptor,
-    connect_to_sender,
-    descriptor,
-    is_from_other_side,
-    is_gone,
-    pause,
-    receive,
-    reply,
-    send,
-    wait_for_frame,
-    wait_readable,
-)
+from quell.realtime.wire import Buffer, is_gone, pause, wait_readable
 from quell.realtime.wire_device import WireDevice
 from quell.types import warn
 
@@ -78,7 +64,7 @@ _sendto = external("sendto", "long", "int", "address", "long", "int", "address",
 class UdpTransport(NamedTuple):
     """One end of a UDP wire; make it with ``udp_transport``."""
 
-    socket: Descriptor
+    socket: wire.Descriptor
     other: NDArray[np.int32]
     """Address of the other side and its length; the length is 0 if the socket is connected."""
     sender: NDArray[np.int32]  # address and length of the sender of the last datagram
@@ -90,18 +76,18 @@ def udp_transport(own: socket.socket) -> UdpTransport:
     """Return the transport of a non-blocking socket."""
     other, sender = (np.zeros(_ADDRESS // 4 + 1, dtype=np.int32) for _ in range(2))
     return UdpTransport(
-        descriptor(own.fileno()), other, sender, other.ctypes.data, sender.ctypes.data
+        wire.descriptor(own.fileno()), other, sender, other.ctypes.data, sender.ctypes.data
     )
 
 
-@receive.register(UdpTransport)
+@wire.receive.register(UdpTransport)
 def _receive(udp: UdpTransport, frame: Buffer) -> int:
     udp.sender[_ADDRESS // 4] = _ADDRESS
     size, length_at = frame.bytes.size, udp.sender_at + _ADDRESS
     return _recvfrom(udp.socket.fd, frame.address, size, 0, udp.sender_at, length_at)
 
 
-@send.register(UdpTransport)
+@wire.send.register(UdpTransport)
 def _send(udp: UdpTransport, frame: Buffer) -> int:
     size = udp.other[_ADDRESS // 4]
     length = frame.length[0]
@@ -109,7 +95,7 @@ def _send(udp: UdpTransport, frame: Buffer) -> int:
     return 0 if sent == length else 1
 
 
-@reply.register(UdpTransport)
+@wire.reply.register(UdpTransport)
 def _reply(udp: UdpTransport, frame: Buffer) -> int:
     size = udp.sender[_ADDRESS // 4]
     length = frame.length[0]
@@ -117,13 +103,13 @@ def _reply(udp: UdpTransport, frame: Buffer) -> int:
     return 0 if sent == length else 1
 
 
-@connect_to_sender.register(UdpTransport)
+@wire.connect_to_sender.register(UdpTransport)
 def _connect_to_sender(udp: UdpTransport) -> None:
     for i in range(udp.other.size):
         udp.other[i] = udp.sender[i]
 
 
-@is_from_other_side.register(UdpTransport)
+@wire.is_from_other_side.register(UdpTransport)
 def _is_from_other_side(udp: UdpTransport) -> bool:
     """Compare host and port; the kernel sets the unused bytes of an address to zero."""
     length = udp.sender[_ADDRESS // 4]
@@ -133,7 +119,7 @@ def _is_from_other_side(udp: UdpTransport) -> bool:
     return differences == 0
 
 
-@wait_for_frame.register(UdpTransport)
+@wire.wait_for_frame.register(UdpTransport)
 def _wait_for_frame(udp: UdpTransport, nanoseconds: int) -> None:
     wait_readable(udp.socket, nanoseconds)
 
@@ -300,9 +286,9 @@ def decode(packet: NDArray[np.uint8], size: int, out: NDArray[np.uint8]) -> int:
 
 BAUD = 921600
 # The bits of a framed frame on the line: 42 bytes with start and stop bit.
-FRAME_BITS = 10 * (LENGTH + 2)
+FRAME_BITS = 10 * (wire.LENGTH + 2)
 # A longer packet is not a frame: the longest one, with a byte of COBS, and one more.
-_LONGEST_FRAME = LENGTH + 8 * MOST_SIGNALS
+_LONGEST_FRAME = wire.LENGTH + 8 * wire.MOST_SIGNALS
 # Bytes per read from the system, and reads at once: a sender that floods the line can't keep the
 # loop from its cycle. Chosen by hand; not tuned further.
 _READ_SIZE = 256
@@ -317,7 +303,7 @@ _write = external("write", "long", "int", "address", "long")
 class SerialTransport(NamedTuple):
     """One end of a serial line; make it with ``serial_transport``."""
 
-    port: Descriptor
+    port: wire.Descriptor
     raw: NDArray[np.uint8]  # bytes read from the system
     packet: NDArray[np.uint8]  # bytes since the last zero
     coded: NDArray[np.uint8]  # the packet to send; the byte before it in memory is a zero
@@ -339,11 +325,11 @@ def serial_transport(fd: int) -> SerialTransport:
     )
     coded, state = out[1:], np.array([0, 0, 0, 1])
     return SerialTransport(
-        descriptor(fd), raw, packet, coded, state, raw.ctypes.data, coded.ctypes.data
+        wire.descriptor(fd), raw, packet, coded, state, raw.ctypes.data, coded.ctypes.data
     )
 
 
-@receive.register(SerialTransport)
+@wire.receive.register(SerialTransport)
 def _receive_serial_line(serial: SerialTransport, frame: Buffer) -> int:
     state = serial.state
     for _ in range(_MOST_READS):
@@ -367,7 +353,7 @@ def _receive_serial_line(serial: SerialTransport, frame: Buffer) -> int:
     return -1
 
 
-@send.register(SerialTransport)
+@wire.send.register(SerialTransport)
 def _send_serial_line(serial: SerialTransport, frame: Buffer) -> int:
     """Send a frame; a zero precedes the first one, and one that follows a partial packet."""
     lead = int(serial.state[_PARTIAL])
@@ -377,7 +363,7 @@ def _send_serial_line(serial: SerialTransport, frame: Buffer) -> int:
     return int(serial.state[_PARTIAL])
 
 
-@wait_for_frame.register(SerialTransport)
+@wire.wait_for_frame.register(SerialTransport)
 def _wait_for_frame_serial_line(serial: SerialTransport, nanoseconds: int) -> None:
     if serial.state[_NEXT] < serial.state[_END]:
         return

@@ -60,17 +60,8 @@ from numpy.typing import NDArray
 
 from quell.kernels.dispatch import generic, generic_with_default, is_finite, kernel
 from quell.kernels.sized import Size
-from quell.realtime.devices import (
-    Tick,
-    ask,
-    drop_signals,
-    read_acting,
-    read_channels,
-    read_measurement,
-    read_signals,
-    read_tick,
-    write_signals,
-)
+from quell.realtime import devices
+from quell.realtime.devices import Tick, drop_signals, read_tick
 from quell.realtime.system import SystemClock, external, now
 
 # ---- The frame that carries one number between a device and the loop ----
@@ -485,7 +476,7 @@ class WireHandle(NamedTuple):
     queue: TickQueue
 
 
-@read_measurement.register(WireHandle)
+@devices.read_measurement.register(WireHandle)
 def _read_measurement(handle: WireHandle, clock: Any, until: int) -> tuple[float, int]:
     """Return the newest measurement; those before it are left out."""
     tick = read_tick(handle, clock, until)
@@ -563,7 +554,7 @@ def _take_channel(handle: WireHandle) -> None:
             queue.newest[place] = value if is_finite(value) else math.nan
 
 
-@read_channels.register(WireHandle)
+@devices.read_channels.register(WireHandle)
 def _read_channels(handle: WireHandle, values: NDArray[np.float64]) -> None:
     shown = handle.queue.shown
     for i in range(values.size):
@@ -607,7 +598,7 @@ def _next(handle: WireHandle, waited: int) -> Tick:
     return Tick(y, steps, queue.used_u[0], counts[_WAITING], waited)
 
 
-@read_signals.register(WireHandle)
+@devices.read_signals.register(WireHandle)
 def _read_signals(handle: WireHandle, y: NDArray[np.float64]) -> None:
     for i in range(y.size):
         y[i] = handle.queue.used_y[i]
@@ -619,13 +610,13 @@ def _drop_signals(handle: WireHandle) -> None:
         handle.queue.used_y[i] = math.nan
 
 
-@read_acting.register(WireHandle)
+@devices.read_acting.register(WireHandle)
 def _read_acting(handle: WireHandle, u: NDArray[np.float64]) -> None:
     for i in range(u.size):
         u[i] = handle.queue.used_u[i]
 
 
-@ask.register(WireHandle)
+@devices.ask.register(WireHandle)
 def _ask(handle: WireHandle) -> None:
     """Repeat the hello of the session: a device is silent if it hears nothing."""
     own, time = handle.endpoint, now(handle.watch)
@@ -641,7 +632,7 @@ def is_own(own: Endpoint, frame: Buffer, kind: int) -> bool:
     return fits and int(frame.words[1]) == own.numbers[SESSION]
 
 
-@write_signals.register(WireHandle)
+@devices.write_signals.register(WireHandle)
 def _write_signals(handle: WireHandle, u: NDArray[np.float64]) -> int:
     own = handle.endpoint
     write_next_numbers(handle.outbox, own, COMMAND, now(handle.watch), u, 0)

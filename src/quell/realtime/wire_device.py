@@ -11,46 +11,10 @@ import numpy as np
 
 from quell import checks
 from quell.kernels.dispatch import call_specialised, compiled, specialised
-from quell.realtime.devices import (
-    SignalCounts,
-    ask,
-    checked_counts,
-    other_counts,
-    read_measurement,
-    write_signals,
-)
+from quell.realtime import devices, wire
+from quell.realtime.devices import read_measurement, write_signals
 from quell.realtime.system import SystemClock, system_clock
-from quell.realtime.wire import (
-    ACCEPTED,
-    BUSY,
-    COMMAND_NOT_SENT,
-    GONE,
-    GOODBYE,
-    HELLO,
-    MEASUREMENT,
-    MOST_SIGNALS,
-    OTHER_DT,
-    SENT,
-    SESSION,
-    SESSION_GONE,
-    STATE,
-    TRIPPED,
-    WATCHDOG_TRIPPED,
-    WELCOME,
-    WireHandle,
-    buffer,
-    counts_by_name,
-    endpoint,
-    is_own,
-    is_well_formed,
-    receive,
-    send,
-    signals_word,
-    start_session,
-    tick_queue,
-    wait_for_frame,
-    write_frame,
-)
+from quell.realtime.wire import WireHandle
 from quell.types import Vector
 
 # A measurement is stale if it answers a command older than this number of samples, or if more than
@@ -62,9 +26,9 @@ _HELLO_EVERY = 0.05
 _SPEAKS_WITHIN = 3
 
 _FAULTS = {
-    COMMAND_NOT_SENT: "the command could not be sent",
-    TRIPPED: "the device's watchdog has set u to zero; begin a new session",
-    SESSION_GONE: "the device has ended the session",
+    wire.COMMAND_NOT_SENT: "the command could not be sent",
+    wire.TRIPPED: "the device's watchdog has set u to zero; begin a new session",
+    wire.SESSION_GONE: "the device has ended the session",
 }
 
 
@@ -108,16 +72,16 @@ class WireDevice:
     _hint = "start one with: quell rig --device {url}"  # advice if no device answers
 
     def __init__(
-        self, url: str, dt: float, timeout: float = 3.0, signals: SignalCounts | None = None
+        self, url: str, dt: float, timeout: float = 3.0, signals: devices.SignalCounts | None = None
     ) -> None:
         self.url = url
         self.dt = checks.positive("dt", dt, "s")
-        self.signal_counts = checked_counts(signals, MOST_SIGNALS)
+        self.signal_counts = devices.checked_counts(signals, wire.MOST_SIGNALS)
         outputs, inputs = self.signal_counts or (1, 1)
-        own = endpoint(MEASUREMENT, _new_session(), _MOST_AGE, outputs)
-        room = 1 if outputs == inputs == 1 else MOST_SIGNALS
-        inbox, outbox, watch = buffer(room), buffer(room), system_clock()
-        queue = tick_queue(outputs, inputs)
+        own = wire.endpoint(wire.MEASUREMENT, _new_session(), _MOST_AGE, outputs)
+        room = 1 if outputs == inputs == 1 else wire.MOST_SIGNALS
+        inbox, outbox, watch = wire.buffer(room), wire.buffer(room), system_clock()
+        queue = wire.tick_queue(outputs, inputs)
         self.handle = WireHandle(self._connect(), own, inbox, outbox, watch, self.dt, queue)
         # Not the handle's: compiled code takes it that its arguments share no memory.
         self._clock = system_clock()
@@ -142,13 +106,13 @@ class WireDevice:
     @property
     def counters(self) -> dict[str, int]:
         """Number of frames from the device by result, see ``quell.realtime.wire``."""
-        return counts_by_name(self.handle.endpoint.counters)
+        return wire.counts_by_name(self.handle.endpoint.counters)
 
     @property
     def lost(self) -> bool:
         """Whether the device's watchdog has set u to zero, or the device has ended the session."""
-        state = self.handle.endpoint.numbers[STATE]
-        return bool(state & (WATCHDOG_TRIPPED | GONE))
+        state = self.handle.endpoint.numbers[wire.STATE]
+        return bool(state & (wire.WATCHDOG_TRIPPED | wire.GONE))
 
     def read(self) -> Any:
         """Return the newest measurement [y-unit]; NaN if none has come for fifty samples.
@@ -190,10 +154,10 @@ class WireDevice:
         """Replace this session by a new one: a device waits only so long for the first command."""
         self._check_open()
         former = self._session
-        self._send(GOODBYE, 0.0, former)
+        self._send(wire.GOODBYE, 0.0, former)
         # If a frame replaces the one before it, the device must have time to read the goodbye.
         time.sleep(min(2.0 * self.dt, _HELLO_EVERY))
-        start_session(self.handle.endpoint, _new_session())
+        wire.start_session(self.handle.endpoint, _new_session())
         self.handle.queue.counts[:] = 0
         self.handle.queue.came[:] = 0  # the values stay until the session has its own
         self._begin_session(former)
@@ -205,9 +169,9 @@ class WireDevice:
         """
         counters = self.handle.endpoint.counters
         self._read_within(0.0)
-        before = counters[ACCEPTED]
+        before = counters[wire.ACCEPTED]
         self._read_within(timeout)
-        if counters[ACCEPTED] == before:
+        if counters[wire.ACCEPTED] == before:
             raise ConnectionError(f"{self.url}: no measurement has come for {timeout:g} s")
         return time.monotonic_ns()
 
@@ -215,7 +179,7 @@ class WireDevice:
         """Send a goodbye, after which the device sets u to zero; a second call does nothing."""
         if self._open:
             self._open = False
-            self._send(GOODBYE, 0.0, self._session)
+            self._send(wire.GOODBYE, 0.0, self._session)
             self._release()
 
     def __enter__(self) -> Self:
@@ -227,11 +191,11 @@ class WireDevice:
     @property
     def _signals_word(self) -> int:
         counts = self.signal_counts
-        return 0 if counts is None else int(signals_word(*counts))
+        return 0 if counts is None else int(wire.signals_word(*counts))
 
     @property
     def _session(self) -> int:
-        return int(self.handle.endpoint.numbers[SESSION])
+        return int(self.handle.endpoint.numbers[wire.SESSION])
 
     def _begin_session(self, former: int = 0) -> None:
         """Send hellos until a welcome comes.
@@ -242,20 +206,20 @@ class WireDevice:
         apart = max(_HELLO_EVERY, 2.0 * self.dt)
         deadline = time.monotonic() + max(self._timeout, 2.0 * apart)
         while time.monotonic() < deadline:
-            ask(self.handle)
+            devices.ask(self.handle)
             for state in self._welcomes(apart):
                 if state == 0:
                     return
                 refusal = state
                 if former:
-                    self._send(GOODBYE, 0.0, former)
-        if refusal & BUSY:
+                    self._send(wire.GOODBYE, 0.0, former)
+        if refusal & wire.BUSY:
             raise ConnectionError(
                 f"{self.url}: another session is active there; end it first; "
                 "a session whose loop was killed ends after a minute"
             )
         if self.signal_counts is not None:  # a device of one y and one u knows no longer hello
-            self._send(HELLO, self.dt, self._session)
+            self._send(wire.HELLO, self.dt, self._session)
             for _ in self._welcomes(apart):
                 pass
         raise ConnectionError(f"{self.url}: no device answers; {self._hint.format(url=self.url)}")
@@ -265,18 +229,20 @@ class WireDevice:
         handle, end = self.handle, time.monotonic() + seconds
         frame, own = handle.inbox, handle.endpoint
         while (left := end - time.monotonic()) > 0.0:
-            wait_for_frame(handle.transport, round(1e9 * left))
-            while (size := receive(handle.transport, frame)) >= 0:
-                if not is_well_formed(frame, size, own.counters):
+            wire.wait_for_frame(handle.transport, round(1e9 * left))
+            while (size := wire.receive(handle.transport, frame)) >= 0:
+                if not wire.is_well_formed(frame, size, own.counters):
                     continue
-                if not is_own(own, frame, WELCOME):
+                if not wire.is_own(own, frame, wire.WELCOME):
                     continue
                 state, dt = int(frame.words[8]), float(frame.doubles[3])
                 if state >> 8 != self._signals_word >> 8:
-                    theirs = SignalCounts(max(state >> 8 & 0xFF, 1), max(state >> 16 & 0xFF, 1))
-                    raise ValueError(other_counts(self.url, theirs, self.signal_counts))
+                    theirs = devices.SignalCounts(
+                        max(state >> 8 & 0xFF, 1), max(state >> 16 & 0xFF, 1)
+                    )
+                    raise ValueError(devices.other_counts(self.url, theirs, self.signal_counts))
                 state &= 0xFF
-                if state & OTHER_DT:
+                if state & wire.OTHER_DT:
                     raise ValueError(
                         f"dt = {self.dt!r} s: the device at {self.url} ticks every {dt!r} s; "
                         "both must be the same"
@@ -285,8 +251,8 @@ class WireDevice:
 
     def _send(self, kind: int, value: float, session: int) -> None:
         out = self.handle.outbox
-        write_frame(out, kind, session, 0, 0, time.monotonic_ns(), value, 0)
-        send(self.handle.transport, out)
+        wire.write_frame(out, kind, session, 0, 0, time.monotonic_ns(), value, 0)
+        wire.send(self.handle.transport, out)
 
     def _read_within(self, seconds: float) -> float:
         """Return the newest measurement, or the first that comes within ``seconds``.
@@ -301,13 +267,13 @@ class WireDevice:
             specialised(_write, handle, np.zeros(handle.queue.used_u.size))
         read = specialised(_read, handle, clock, 0)
         numbers, counters = handle.endpoint.numbers, handle.endpoint.counters
-        unanswered, self._answered = self._answered == numbers[SENT], numbers[SENT]
-        accepted, begin = counters[ACCEPTED], time.monotonic_ns()
+        unanswered, self._answered = self._answered == numbers[wire.SENT], numbers[wire.SENT]
+        accepted, begin = counters[wire.ACCEPTED], time.monotonic_ns()
         soon = min(seconds, _SPEAKS_WITHIN * self.dt) if unanswered else seconds
         y = float(read(handle, clock, begin + round(1e9 * soon))[0])
-        if counters[ACCEPTED] > accepted or soon == seconds:
+        if counters[wire.ACCEPTED] > accepted or soon == seconds:
             return y
-        ask(handle)
+        devices.ask(handle)
         return float(read(handle, clock, begin + round(1e9 * seconds))[0])
 
     def _check_open(self) -> None:

@@ -7,41 +7,30 @@ from dataclasses import fields
 from typing import Any
 
 from quell import checks
+from quell.signals import shapes
 from quell.signals.excitation import PRBS, BandLimitedNoise, Multisine
 from quell.signals.moves import LimitedMove
-from quell.signals.shapes import (
-    Chirp,
-    Constant,
-    Ramp,
-    Repeated,
-    Samples,
-    Signal,
-    Sinusoid,
-    SmoothMove,
-    Step,
-    Trapezoid,
-)
 
-KINDS: Mapping[str, type[Signal]] = {
-    "constant": Constant,
-    "step": Step,
-    "ramp": Ramp,
-    "sinusoid": Sinusoid,
-    "chirp": Chirp,
+KINDS: Mapping[str, type[shapes.Signal]] = {
+    "constant": shapes.Constant,
+    "step": shapes.Step,
+    "ramp": shapes.Ramp,
+    "sinusoid": shapes.Sinusoid,
+    "chirp": shapes.Chirp,
     "prbs": PRBS,
     "multisine": Multisine,
-    "trapezoid": Trapezoid,
-    "move": SmoothMove,
-    "smooth-move": SmoothMove,  # the same, by the name of the class
+    "trapezoid": shapes.Trapezoid,
+    "move": shapes.SmoothMove,
+    "smooth-move": shapes.SmoothMove,  # the same, by the name of the class
     "limited-move": LimitedMove,
-    "samples": Samples,
-    "repeated": Repeated,
+    "samples": shapes.Samples,
+    "repeated": shapes.Repeated,
     "noise": BandLimitedNoise,
 }
 """The signals that setup files can have, by their ``kind``."""
 
 
-def make(kind: str, **parameters: Any) -> Signal:
+def make(kind: str, **parameters: Any) -> shapes.Signal:
     """Return a signal from the name of its kind and its parameters.
 
     Raises

@@ -37,14 +37,7 @@ from quell.plants.base import Plant, PlantBatch, check_plant, signals_of
 from quell.plants.linear import LinearPlant, sampled_together
 from quell.records.record import columns_of, readable_names, signals_of_loop
 from quell.records.trajectory import BatchTrajectory, Trajectory
-from quell.simulation.driver import (
-    Loop,
-    judge_integration,
-    judged,
-    logged_channels,
-    warn_of_lost,
-    width_of_signals,
-)
+from quell.simulation import driver
 from quell.simulation.scenario import (
     SampledScenario,
     Scenario,
@@ -90,7 +83,7 @@ def simulate_batch(
     checks.optional(checks.positive, "limit", limit)
     sampled = _sampled(scenarios, plants[0], controllers, limit)
     dt, samples, runs = sampled[0].dt, sampled[0].samples, len(sampled)
-    logged = logged_channels(plants[0], controllers[0])
+    logged = driver.logged_channels(plants[0], controllers[0])
     width = sum(width for _, width in logged)
     usual = [name for name, _ in logged if name in _RECORDED]
     channels = _selected(usual if record is None else record, logged)
@@ -99,24 +92,24 @@ def simulate_batch(
     # Channel by channel, so that a channel of all runs is contiguous in memory.
     log = np.empty((len(recorded), runs, (samples - 1) // every + 1))
     outcome = Outcome(log, *(np.zeros(runs, dtype=np.int64) for _ in range(3)))
-    loops: list[Loop] = []
-    first: dict[Any, Loop] = {}
+    loops: list[driver.Loop] = []
+    first: dict[Any, driver.Loop] = {}
     for i, model in enumerate(_models(plants, dt, interpret)):
         compiled = not interpret and plants[i].compiled
         structure = (id(controllers[i]), layout_of(model)) if compiled else i
         like = first.get(structure)
-        loops.append(Loop(plants[i], model, controllers[i], sampled[i], interpret, like))
+        loops.append(driver.Loop(plants[i], model, controllers[i], sampled[i], interpret, like))
         first.setdefault(structure, loops[i])
-    narrow = width_of_signals(plants[0], controllers[0])
+    narrow = driver.width_of_signals(plants[0], controllers[0])
     if max(columns) < narrow and not any(loop.integration.needed for loop in loops):
         width = narrow  # states and estimates are not used
     _run_loops(loops, columns, width, every, outcome, progress, workers)
     for i in np.flatnonzero(outcome.lengths < log.shape[2]).tolist():
         log[:, i, outcome.lengths[i] :] = np.nan
     name = plants.name if isinstance(plants, PlantBatch) else plants[0].name
-    judge_integration(name, loops)
+    driver.judge_integration(name, loops)
     outcome.ended[:] = [loop.ended for loop in loops]
-    outcome.status[:] = judged(np.moveaxis(log, 0, -1), channels, loops)
+    outcome.status[:] = driver.judged(np.moveaxis(log, 0, -1), channels, loops)
     found: dict[str, Any] = {
         "log": np.moveaxis(log, 0, -1),
         "channels": channels,
@@ -148,7 +141,7 @@ def is_of_several(controller: Any) -> bool:
 
 
 def _run_loops(
-    loops: Sequence[Loop],
+    loops: Sequence[driver.Loop],
     columns: Sequence[int],
     width: int,
     every: int,
@@ -401,7 +394,7 @@ def simulate(
     if any(checks.is_sequence(value) for value in (plant, controller, scenario)):
         options = (record_every, limit, interpret, progress, record, workers)
         runs = simulate_batch(plant, controller, scenario, *options)
-        warn_of_lost(runs)
+        driver.warn_of_lost(runs)
         return runs
     for name, value in (("record", record), ("workers", workers)):
         if value is not None:
@@ -413,15 +406,15 @@ def simulate(
     every = checks.whole("record_every", record_every, 1)
     sampled = SampledScenario.of(scenario, plant, controller, limit)
     dt = sampled.dt
-    loop = Loop(plant, plant.sampled(dt, interpret), controller, sampled, interpret)
-    channels = logged_channels(plant, controller)
+    loop = driver.Loop(plant, plant.sampled(dt, interpret), controller, sampled, interpret)
+    channels = driver.logged_channels(plant, controller)
     log = loop.run_through(every, progress)
     run = Trajectory(
         log=log,
         channels=channels,
         dt=dt,
         every=every,
-        status=Status(int(judged(log[None], channels, [loop])[0])),
+        status=Status(int(driver.judged(log[None], channels, [loop])[0])),
         ended=loop.ended * dt,
         limit=sampled.limit,
         plant=plant.name,
@@ -429,7 +422,7 @@ def simulate(
         final_state=loop.state,
         **_names_of(plant, controller),
     )
-    warn_of_lost(run)
+    driver.warn_of_lost(run)
     return run
 
 
@@ -503,7 +496,7 @@ def _size(part: object) -> int:
 def _is_compiled(parts: Parts) -> bool:
     plant, controller = parts
     scenario = SampledScenario.of(_short(controller), plant, controller, None)
-    loop = Loop(plant, plant.sampled(controller.dt), controller, scenario, interpret=False)
+    loop = driver.Loop(plant, plant.sampled(controller.dt), controller, scenario, interpret=False)
     return loop.is_compiled(scenario.segment(0, 1))
 
 
