@@ -284,9 +284,7 @@ def by_axis(run: Trajectory) -> dict[str, Trajectory]:
     return {name: run.axis(name) for name in run.axis_names} or {"": run}
 
 
-def with_one_gain(
-    runs: Mapping[str, Trajectory],
-) -> tuple[dict[str, Trajectory], OneGain]:
+def with_one_gain(runs: Mapping[str, Trajectory]) -> tuple[dict[str, Trajectory], OneGain]:
     """Return runs by name whose v, of several axes, can be compared, and how.
 
     Of runs of several axes only the samples under control are left, in the units of the first; a

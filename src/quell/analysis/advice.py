@@ -263,11 +263,7 @@ def _judge_learner(
 
 
 def _judge_lag(
-    loop: LoopAnalysis,
-    late: LoopAnalysis,
-    actuator_lag: float,
-    delay: float,
-    observer: ESO | None,
+    loop: LoopAnalysis, late: LoopAnalysis, actuator_lag: float, delay: float, observer: ESO | None
 ) -> list[Finding]:
     *times, margin = durations(actuator_lag, delay, loop.margins.delay)
     parts = zip(("an actuator lag", "a delay"), times, (actuator_lag, delay), strict=True)

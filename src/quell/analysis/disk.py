@@ -208,9 +208,7 @@ def factors_of(delta: Complex, skew: float) -> tuple[complex, ...]:
 
 
 def largest_scaled(
-    matrices: Callable[[Vector], Complex],
-    omega: Vector,
-    values: Complex,
+    matrices: Callable[[Vector], Complex], omega: Vector, values: Complex
 ) -> tuple[float, float]:
     """Return the largest ``min_D σ̄(D M D⁻¹)`` over the frequencies, and where it is.
 

@@ -59,11 +59,7 @@ def law_of_feedback(controller: StateFeedback) -> MatrixLaw:
 
 
 def analyse_feedback(
-    controller: StateFeedback,
-    plant: Any = None,
-    *,
-    u_size: Any = None,
-    y_size: Any = None,
+    controller: StateFeedback, plant: Any = None, *, u_size: Any = None, y_size: Any = None
 ) -> MultivariableLoop:
     """Analyse the loop of state feedback with a plant, unlimited, with all sensors measured.
 

@@ -533,9 +533,7 @@ def _of_kalman(design: KalmanDesign, omega: Vector) -> Adaptation:
     firsts = np.flatnonzero(np.append(True, apart))
     merged = np.add.reduceat(drive[order], firsts)
     return NOTHING._replace(
-        level=level,
-        omega=angular[order][firsts],
-        drive=np.column_stack([merged.real, merged.imag]),
+        level=level, omega=angular[order][firsts], drive=np.column_stack([merged.real, merged.imag])
     )
 
 

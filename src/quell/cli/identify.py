@@ -152,10 +152,7 @@ def identify(
         print_line(console, "NOT: u and y look swapped: the reverse fits well; see --columns")
     others: tuple[Alternative, ...] = ()
     if alternatives:
-        given: dict[str, Any] = {
-            "integrators": of_model.integrators,
-            "friction": of_model.friction,
-        }
+        given: dict[str, Any] = {"integrators": of_model.integrators, "friction": of_model.friction}
         if most is not None:
             given["delay"] = delays
         with console.status("Fitting other structures."):
@@ -285,8 +282,7 @@ def _modes(record: Measured, name: str, outputs: Outputs) -> None:
     if found.decay and u != 0.0:
         results["gain_from_rest"] = (found.at_rest - found.begin) / u
         print_line(
-            console,
-            f"if u was 0 and y at rest before, the gain is {results['gain_from_rest']:.5g}",
+            console, f"if u was 0 and y at rest before, the gain is {results['gain_from_rest']:.5g}"
         )
     paths: list[Path] = []
     if outputs.figures:

@@ -205,10 +205,7 @@ def write_record(console: Console, run: Trajectory, outputs: RunOutputs, name: s
 
 
 def write_results(
-    console: Console,
-    results: dict[str, Any],
-    outputs: ResultOutputs,
-    figures: Sequence[Path] = (),
+    console: Console, results: dict[str, Any], outputs: ResultOutputs, figures: Sequence[Path] = ()
 ) -> None:
     """Write the results to the JSON file, if any; print where they and the figures are."""
     from quell.files import write_json

@@ -46,8 +46,7 @@ class Section(NamedTuple):
 
 
 def docs(
-    *words: str,
-    browser: Annotated[bool, Parameter(name="--browser", negative="")] = False,
+    *words: str, browser: Annotated[bool, Parameter(name="--browser", negative="")] = False
 ) -> None:
     """Find a page of the documentation by words, or show the page of a name. Works offline.
 

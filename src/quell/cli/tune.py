@@ -255,12 +255,7 @@ def rig_at(options: RigOptions, at: Works, dt: float | None, trust: bool) -> Rig
 
 
 def from_rig(
-    console: Console,
-    rig: Rig,
-    dt: float,
-    asked: Asked,
-    record: Path | None,
-    overwrite: bool,
+    console: Console, rig: Rig, dt: float, asked: Asked, record: Path | None, overwrite: bool
 ) -> tuple[list[Any], float, dict[str, Any], Identified, float] | None:
     """Run the experiment; return what ``from_record`` does, and where y is; None if not wanted.
 

@@ -645,10 +645,7 @@ class Axes(StatefulController):
         start_all(self.parameters, self._state, samples, *signals)
 
     def track(
-        self,
-        r: Sequence[float] | Vector,
-        y: Sequence[float] | Vector,
-        u: Sequence[float] | Vector,
+        self, r: Sequence[float] | Vector, y: Sequence[float] | Vector, u: Sequence[float] | Vector
     ) -> None:
         """Take one sample in manual operation: ``u`` (m,) is applied, unlimited.
 

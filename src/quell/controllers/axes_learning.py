@@ -97,13 +97,7 @@ def restart_of_all(learning: Any, memory: Any) -> None:
 
 
 def gather_axis(
-    axis: Any,
-    state: Any,
-    i: int,
-    at: int,
-    learning: LearningDesign,
-    before: Vector,
-    now: Vector,
+    axis: Any, state: Any, i: int, at: int, learning: LearningDesign, before: Vector, now: Vector
 ) -> int:
     """Write the signals of an axis, whose states begin at ``at``; return where those behind begin.
 

@@ -236,13 +236,7 @@ class Compensator(StatefulController):
         self._warn_of_idle_guard()
 
     def _take_parts(
-        self,
-        observer: Any,
-        learner: Any,
-        guard: Any,
-        safe_set: Any,
-        held: Any,
-        schedule: Any,
+        self, observer: Any, learner: Any, guard: Any, safe_set: Any, held: Any, schedule: Any
     ) -> None:
         """Check and keep observer, learner, guard and the other parts."""
         if not isinstance(observer, ESO):

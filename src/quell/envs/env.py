@@ -46,11 +46,7 @@ class Observed:
     """
 
     def __init__(
-        self,
-        names: Sequence[str] | None,
-        loop: Loops,
-        action: Actions,
-        x_limit: Any,
+        self, names: Sequence[str] | None, loop: Loops, action: Actions, x_limit: Any
     ) -> None:
         if isinstance(names, str):
             names = (names,)

@@ -41,10 +41,7 @@ def examples(listening: bool = False) -> str:
 
 
 def open_device(
-    device: str | Device,
-    dt: float,
-    trust: bool = False,
-    signals: tuple[int, int] | None = None,
+    device: str | Device, dt: float, trust: bool = False, signals: tuple[int, int] | None = None
 ) -> Any:
     """Return the device of a URL.
 

@@ -32,13 +32,7 @@ _RECORDED = ("r", "y", "y_measured", "u")
 _NO_DERIVATIVES = np.zeros(0)
 
 
-def replay(
-    run: Any,
-    controller: Any,
-    *,
-    u_before: Any = None,
-    channels: Sequence[str] = (),
-) -> Any:
+def replay(run: Any, controller: Any, *, u_before: Any = None, channels: Sequence[str] = ()) -> Any:
     """Let a controller follow a recorded run.
 
     It starts with nothing learned, on a state of its own, as in ``simulate``. The controller that

@@ -114,10 +114,7 @@ def log_columns(outputs: int, inputs: int) -> tuple[str, ...]:
     if outputs == inputs == 1:
         return LOG
     counts = {"y": outputs, "u": inputs, "command": inputs}
-    return (
-        *LOG[:4],
-        *(f"{name}[{i}]" for name, count in counts.items() for i in range(count)),
-    )
+    return (*LOG[:4], *(f"{name}[{i}]" for name, count in counts.items() for i in range(count)))
 
 
 @generic_with_default

@@ -182,10 +182,7 @@ def lost_changes(state: SupervisorState, dt: float) -> tuple[str, ...]:
 
 
 def silence_of(
-    record: Any,
-    changes: Sequence[ModeChange],
-    before: Mapping[str, int],
-    after: Mapping[str, int],
+    record: Any, changes: Sequence[ModeChange], before: Mapping[str, int], after: Mapping[str, int]
 ) -> tuple[str, ...]:
     """Return a note that says what came from the device when missed samples ended the run.
 

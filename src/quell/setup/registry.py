@@ -419,10 +419,7 @@ AxesTune = call_table(
     tuning,
     only=True,
     forwards_to=(tune, Constraints),
-    types={
-        "objective": Literal[OBJECTIVES],
-        "operating_points": Sequence[Sequence[float]] | None,
-    },
+    types={"objective": Literal[OBJECTIVES], "operating_points": Sequence[Sequence[float]] | None},
     without=tuple(_OF_ALL - _OF_SEVERAL),
 )
 _NO_KEYS = ("duration", "on_change", "overwrite")

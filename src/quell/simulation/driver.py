@@ -191,10 +191,7 @@ class Loop:
         from_row, from_sample = row, first + self.until_next
         # An interpreted loop that diverges would warn of every overflow; the status reports it
         # once.
-        with (
-            np.errstate(all="ignore"),
-            explain_compile_errors(self.model, self.design),
-        ):
+        with np.errstate(all="ignore"), explain_compile_errors(self.model, self.design):
             if from_rest:
                 self.x[:] = self.x0
                 begin_run(self.model, self.x, self.scratch)

@@ -129,11 +129,7 @@ class Scenario(Described):
             every = tuple(seeded_apart((*reference, *given, *noise), self.seed))
             noise = every[-outputs:]
         disturbances = every[references : references + len(given)]
-        return (
-            every[:references],
-            disturbances + (Constant(0.0),) * (inputs - len(given)),
-            noise,
-        )
+        return (every[:references], disturbances + (Constant(0.0),) * (inputs - len(given)), noise)
 
 
 def _one_for_each(name: str, given: Any, count: int, alone: bool) -> tuple[Signal, ...]:

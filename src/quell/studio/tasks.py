@@ -143,11 +143,7 @@ def tuned_frames(
 
 
 def compared_frames(
-    setup: Setup,
-    record: PageRecord,
-    message: Mapping[str, Any],
-    stale: Stale,
-    report: Report,
+    setup: Setup, record: PageRecord, message: Mapping[str, Any], stale: Stale, report: Report
 ) -> Iterator[bytes]:
     """Yield runs and loops of PID and LQG controllers that were tuned for the same plant.
 

@@ -222,10 +222,7 @@ class Groups(NamedTuple):
 
 
 def groups_of(
-    values: NDArray[Any],
-    texts: list[str] | None,
-    done: NDArray[np.bool_],
-    most: int = _MOST_GROUPS,
+    values: NDArray[Any], texts: list[str] | None, done: NDArray[np.bool_], most: int = _MOST_GROUPS
 ) -> Groups:
     """Return the runs that are done by the value of a parameter, which may be one of some texts.
 

@@ -412,11 +412,7 @@ def _families(model: Any, dt: float) -> Iterator[_Family]:
 
 
 def _searched(
-    family: _Family,
-    controller: Controller,
-    plants: _Plants,
-    bounds: Constraints,
-    model: Any,
+    family: _Family, controller: Controller, plants: _Plants, bounds: Constraints, model: Any
 ) -> list[_Candidate]:
     """Return the observers of a family that keep the bounds, of those that the search tried."""
     fastest = bounds.omega_o_dt / plants.all.dt

@@ -321,11 +321,7 @@ def worst_step(written: Written, controller: Controller, last: int | None = None
 
 
 def reference_model_for(
-    written: Written,
-    controller: Controller,
-    omega: float,
-    order: int = _ORDER,
-    within: bool = True,
+    written: Written, controller: Controller, omega: float, order: int = _ORDER, within: bool = True
 ) -> Shaped:
     """Return the reference model with which the step of the file settles soonest.
 

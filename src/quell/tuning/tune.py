@@ -655,9 +655,7 @@ def _check(
     if box is None:
         linear = [given.linear[i % len(given.linear)] for i in range(count)]
         fresh = given._replace(
-            linear=tuple(linear),
-            delays=np.resize(given.delays, count),
-            factors=np.ones(1),
+            linear=tuple(linear), delays=np.resize(given.delays, count), factors=np.ones(1)
         )
         values, names = factors[:, None], ["b/b0"]
     else:

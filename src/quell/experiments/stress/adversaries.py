@@ -285,10 +285,7 @@ _DRAWS: dict[str, Callable[[np.random.Generator], Learner]] = {
         FLIPPING, rng.uniform(0.5, 2.0), log_uniform(rng, 0.1, 20.0), seed=_seed(rng)
     ),
     "NaN and Inf": lambda rng: Adversary(
-        _one_of(rng, NAN, INF),
-        rng.uniform(0.5, 1.2),
-        log_uniform(rng, 0.05, 30.0),
-        seed=_seed(rng),
+        _one_of(rng, NAN, INF), rng.uniform(0.5, 1.2), log_uniform(rng, 0.05, 30.0), seed=_seed(rng)
     ),
     "Algorithm 1": lambda rng: BatchGradient(rate=log_uniform(rng, 1e-7, 1.0)),
     "turncoat": lambda rng: Turncoat(

@@ -576,11 +576,7 @@ def _rest_to_json(outcome: RestOutcome) -> dict[str, Any]:
 
 
 def run(
-    count: int,
-    seed: int,
-    *,
-    guard: Guard | None,
-    progress: Callable[[float], None] | None = None,
+    count: int, seed: int, *, guard: Guard | None, progress: Callable[[float], None] | None = None
 ) -> AxesResult:
     """Run the trial on ``count`` flexible axes, with the guard or without (None).
 

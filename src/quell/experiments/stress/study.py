@@ -164,9 +164,7 @@ class Bar(NamedTuple):
 
 
 def bars_of(
-    table: Sequence[tuple[str, str, str, float]],
-    kind: Any,
-    groups: Mapping[str, Sequence[Judged]],
+    table: Sequence[tuple[str, str, str, float]], kind: Any, groups: Mapping[str, Sequence[Judged]]
 ) -> list[Bar]:
     """Return the bars of a table: what each is over, what it measures, its place in a summary.
 

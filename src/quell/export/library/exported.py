@@ -193,10 +193,7 @@ def _values(source: CSource, dt: float, limit: str) -> dict[str, object]:
 
 # What is otherwise for several axes.
 _OPERATIONS_OF_AXES = _OPERATIONS | {
-    "start": (
-        "start(s, y, u, r)",
-        "the machine rests at y under u; long: before the timer starts",
-    ),
+    "start": ("start(s, y, u, r)", "the machine rests at y under u; long: before the timer starts"),
     "step": ("step(s, r, yDERIVATIVES, u)", "each sample; writes u"),
     "set_held": (
         "set_held(s, axis, held)",

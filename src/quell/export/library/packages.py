@@ -32,10 +32,7 @@ def arduino_objection(name: str) -> str:
 
 def package_files(source: CSource, values: Mapping[str, object]) -> dict[str, str]:
     """Return the text of the files of package managers by path."""
-    return {
-        **{each: filled(each, values) for each in FILES},
-        "keywords.txt": _keywords(source),
-    }
+    return {**{each: filled(each, values) for each in FILES}, "keywords.txt": _keywords(source)}
 
 
 def package_note(source: CSource) -> str:

@@ -525,9 +525,7 @@ class Function:
         used = names_in_block(block)
         self.used = [name for name in names if identifier(name) in used]
         place_declarations(
-            block,
-            local,
-            lambda name, constant: self._declaration(body, name, constant),
+            block, local, lambda name, constant: self._declaration(body, name, constant)
         )
         self.block = block
         self.name = ""

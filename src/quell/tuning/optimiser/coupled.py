@@ -277,10 +277,7 @@ def closed(plant: Plant, laws: Sequence[LinearLaw]) -> Matrix:
     N = plant.A - np.eye(plant.A.shape[0])
     inner = law.A - np.eye(law.A.shape[0])
     return np.block(
-        [
-            [N + plant.B @ law.D_y @ plant.C, plant.B @ law.C],
-            [law.B_y @ plant.C, inner],
-        ]
+        [[N + plant.B @ law.D_y @ plant.C, plant.B @ law.C], [law.B_y @ plant.C, inner]]
     )
 
 

@@ -250,12 +250,7 @@ class FiniteProblem:
     """Cost and constraints at points, as functions of the logarithms x (p,) of the parameters."""
 
     def __init__(
-        self,
-        problem: Problem,
-        structure: Structure,
-        points: Points,
-        followed: Followed,
-        x: Vector,
+        self, problem: Problem, structure: Structure, points: Points, followed: Followed, x: Vector
     ) -> None:
         self._problem, self._structure, self._points = problem, structure, points
         self._followed = followed

@@ -554,10 +554,7 @@ def _rungs(samples: int) -> list[int]:
 
 
 def _evaluate(
-    build: Build,
-    problem: Problem,
-    violation: Callable[[Controller], float] | None,
-    task: _Task,
+    build: Build, problem: Problem, violation: Callable[[Controller], float] | None, task: _Task
 ) -> _Score:
     try:
         controller = build(task.values)

@@ -8,11 +8,7 @@ from quell.tuning.structures import baselines
 from quell.tuning.structures.adrc import AdrcStructure, Form
 from quell.tuning.structures.base import Model, Structure
 
-_PID = {
-    "pi": (False, True),
-    "pi-unfiltered": (False, False),
-    "pid": (True, True),
-}
+_PID = {"pi": (False, True), "pi-unfiltered": (False, False), "pid": (True, True)}
 _ADRC = {
     "bandwidths": Form(),
     "poles": Form(free_poles=True),
