@@ -26,7 +26,6 @@ ROWS = (
     ("sweeping",),
     (
         "tuning.constraints",
-        "tuning.load_spectrum",
         "tuning.structures",
         "tuning.optimiser",
         "tuning.simulated",

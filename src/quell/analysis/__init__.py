@@ -16,11 +16,10 @@ from quell.analysis.feedback import (
 )
 from quell.analysis.linearise import Adapting, Frozen, adapting, frozen, linear_law
 from quell.analysis.loop import LoopAnalysis
-from quell.analysis.machine import analyse, certify
+from quell.analysis.machine import OnlineCertificate, analyse, certify, certify_online
 from quell.analysis.margins import Margins
 from quell.analysis.matrices import MatrixLaw, axes_law
 from quell.analysis.multivariable import MultivariableLoop, Peak, Pole
-from quell.analysis.online import OnlineCertificate, certify_online
 from quell.analysis.plots import (
     loops_over_omega_o,
     loops_over_time,

@@ -1,16 +1,15 @@
 """Tuning: the controller of a structure with the best objective under constraints.
 
-May import ``identification`` and what stands before it. ``constraints`` and ``load_spectrum`` say
-what is asked for, ``structures`` has the families of controllers and their free parameters,
-``loops`` the frequency responses of a set of plants, ``search`` the optimiser, ``axes`` the
-bandwidths of several axes; ``tune`` puts them together and returns a ``Tuned``.
+May import ``identification`` and what stands before it. ``constraints`` says what is asked
+for, ``structures`` has the families of controllers and their free parameters, ``loops`` the
+frequency responses of a set of plants, ``search`` the optimiser, ``axes`` the bandwidths of several
+axes; ``tune`` puts them together and returns a ``Tuned``.
 """
 
 from quell.lazy import imported_on_use, public_names
 from quell.tuning.compensator import OnTop, tune_compensator
-from quell.tuning.constraints import Constraints
+from quell.tuning.constraints import Constraints, LoadSpectrum
 from quell.tuning.interaction import Interaction, Reached
-from quell.tuning.load_spectrum import LoadSpectrum
 from quell.tuning.plants import identified_plants
 from quell.tuning.report import Design
 from quell.tuning.schedules import AtPoints, tune_schedule

@@ -24,7 +24,7 @@ from quell.signals.shapes import Signal, as_signal
 from quell.tuning import acceptance
 from quell.tuning.axes import tune_together
 from quell.tuning.by_simulation import tune_by_simulation
-from quell.tuning.constraints import Constraints, given_constraints
+from quell.tuning.constraints import Constraints, LoadSpectrum, given_constraints
 from quell.tuning.designs import (
     SIMPLEST,
     Task,
@@ -34,7 +34,6 @@ from quell.tuning.designs import (
     with_noise_bound,
     without_damping,
 )
-from quell.tuning.load_spectrum import LoadSpectrum
 from quell.tuning.optimiser.loops import Inputs, PlantSet, load_step, samples_of
 from quell.tuning.optimiser.requirements import OBJECTIVES, OF_SPECTRUM
 from quell.tuning.plants import (

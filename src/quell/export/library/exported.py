@@ -22,7 +22,6 @@ from quell import checks
 from quell.controllers.base import check_controller
 from quell.export.c_files import CSource
 from quell.export.controller_source import c_source, in_double_precision, is_in_single, limits_path
-from quell.export.library.packages import package_files, package_note
 from quell.export.library.precision import Comparison, checked_comparison
 from quell.export.library.vectors import (
     TOLERANCE_REASON,
@@ -142,7 +141,8 @@ def library_files(controller: Any, source: CSource, vectors: Vectors) -> dict[st
         f"test_{name}.c": test_program(source, vectors),
         f"examples/{name}/{name}.ino": filled(f"example{kind}.ino", values),
         **{each: filled(each, values) for each in _TEXTS},
-        **package_files(source, values),
+        **{each: filled(each, values) for each in FILES},
+        "keywords.txt": _keywords(source),
     }
 
 
@@ -636,3 +636,42 @@ def _function_table(source: CSource) -> str:
         "counted once. Functions of the C library are not counted, nor registers of interrupts.\n\n"
         f"| function | stack at most [bytes] | instructions in the code |\n|---|---|---|\n{rows}"
     )
+
+
+# ---- The files by which package managers know an exported controller ----
+
+FILES = ("LICENSE", "idf_component.yml", "library.json", "library.properties")
+"""Templates of the root of the folder; ``keywords.txt`` is written from the header."""
+
+# Rules LP010, LP014 and LP016 of arduino-lint with --compliance strict.
+_LONGEST_NAME = 32
+_WORDS = ("arduino", "library")
+
+
+def package_note(source: CSource) -> str:
+    """Return the paragraph of README.md on what to change before the folder is published."""
+    name = source.name
+    objections = [f"{word} in it" for word in _WORDS if word in name.lower()]
+    if len(name) > _LONGEST_NAME:
+        objections.append(f"{len(name)} characters, {_LONGEST_NAME} are allowed")
+    if not objections:
+        return ""
+    return (
+        f"NOT for Arduino's Library Manager: the name {name} has {objections[0]}. Export with "
+        "another name to submit it; in your\nsketchbook the folder works as it is.\n\n"
+    )
+
+
+def _keywords(source: CSource) -> str:
+    """Return ``keywords.txt``: types, functions and constants that Arduino's editor colours."""
+    name, upper = source.name, source.name.upper()
+    types = re.findall(rf"^(?:}} |typedef \w+ )({name}_\w+);$", source.header, re.M)
+    constants = re.findall(rf"^#define ({upper}_\w+) ", source.header, re.M)
+    for members in re.findall(r"^enum \w+ \{(.*?)\}", source.header, re.M | re.S):
+        constants += re.findall(rf"\b({upper}_\w+) =", members)
+    rows = [
+        *((each, "KEYWORD1") for each in types),
+        *((f"{name}_{each}", "KEYWORD2") for each in source.operations),
+        *((each, "LITERAL1") for each in (*constants, f"{name}_default_parameters")),
+    ]
+    return "".join(f"{word}\t{kind}\n" for word, kind in dict(rows).items())

@@ -50,8 +50,7 @@ from numpy.typing import NDArray
 
 from quell.analysis.loop import closed_loop_matrix, law_matrix
 from quell.analysis.margins import Complex, eigenvalues, in_s_plane
-from quell.tuning.constraints import Constraints
-from quell.tuning.load_spectrum import LoadSpectrum
+from quell.tuning.constraints import Constraints, LoadSpectrum
 from quell.tuning.optimiser import loops
 from quell.tuning.structures.base import Structure
 from quell.types import Matrix, Vector

@@ -16,8 +16,7 @@ from quell.analysis.margins import Complex
 from quell.controllers.base import Controller
 from quell.controllers.feedforward import Feedforward
 from quell.plants.linear import LinearPlant
-from quell.tuning.constraints import Constraints
-from quell.tuning.load_spectrum import LoadSpectrum
+from quell.tuning.constraints import Constraints, LoadSpectrum
 from quell.types import Matrix, Vector
 
 RESONANT = 0.5
