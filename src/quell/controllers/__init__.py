@@ -16,12 +16,6 @@ from quell.controllers.axes import Axes
 from quell.controllers.base import Controller, omega_c_for
 from quell.controllers.compensated import Compensated
 from quell.controllers.compensator import Compensator, Estimate
-from quell.controllers.feedback_gains import (
-    Regulator,
-    quadratic_feedback,
-    regulator,
-    state_feedback,
-)
 from quell.controllers.feedforward import Feedforward
 from quell.controllers.from_pid import PidEqual, equal_to_pid
 from quell.controllers.held import HeldPlant
@@ -38,7 +32,13 @@ from quell.controllers.safe_set import SafeSet
 from quell.controllers.schedule import Schedule
 from quell.controllers.shaping import ProfileGenerator
 from quell.controllers.single import in_single_precision
-from quell.controllers.state_space import StateFeedback
+from quell.controllers.state_space import (
+    Regulator,
+    StateFeedback,
+    quadratic_feedback,
+    regulator,
+    state_feedback,
+)
 from quell.lazy import imported_on_use, public_names
 
 __all__ = [
