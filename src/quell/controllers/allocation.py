@@ -59,7 +59,7 @@ import numpy as np
 from numba import types as nb_types
 
 from quell import checks
-from quell.controllers.base import Limits, RateLimit, checked_limits
+from quell.controllers.base import RateLimit, checked_limits
 from quell.kernels import user_functions
 from quell.kernels.dispatch import generic, is_finite, kernel
 from quell.kernels.frozen import frozen, kept_code
@@ -677,12 +677,6 @@ def changed_actuator_limits(
     if rate_limit is None:
         new = new._replace(most_change=old.most_change, least_change=old.least_change)
     return new
-
-
-def limits_of_actuator(limits: ActuatorLimits, i: int) -> Limits:
-    """Return the limits of one actuator."""
-    low, high, most, least = (float(part[i]) for part in limits)
-    return Limits(low, high, most, least)
 
 
 class Gain(NamedTuple):
