@@ -274,8 +274,8 @@ def test_a_process_that_overshoots_little_needs_no_prefilter() -> None:
     for limits, within in (((-1.0, 1.0), False), ((-1.0, math.inf), True)):
         model = Mock(return_value=Shaped(None, None))
         with (
-            patch.object(acceptance, "reference_model_for", model),
-            patch.object(acceptance, "bounded_rate", lambda *_: (None, None)),
+            patch.object(reference, "reference_model_for", model),
+            patch.object(reference, "bounded_rate", lambda *_: (None, None)),
             patch.object(Written, "overloads", lambda *_: []),
         ):
             judge(loop._replace(limits=limits), quick, of(quick))
@@ -323,7 +323,7 @@ def test_an_axis_with_limits_gets_a_profile_generator() -> None:
     controller = ql.ADRC(ql.ESO.model_free(2, 4.0, 8.0, DT), 2.0, u_min=-1.0, u_max=2.0)
     analysis = analyse(plant, ql.ADRC(ql.ESO.model_free(2, 4.0, 8.0, DT), 2.0))
     with (
-        patch.object(acceptance, "profile_for", profile),
+        patch.object(reference, "profile_for", profile),
         patch.object(Written, "overloads", lambda *_: []),
     ):
         judge(loop, controller, analysis)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import quell as ql
-from quell.tuning import Constraints, compensator, designs, report
+from quell.tuning import Constraints, acceptance, compensator, designs, report
 from quell.tuning.designs import Task
 from quell.tuning.optimiser.loops import load_step
 from quell.tuning.optimiser.requirements import Active
@@ -365,8 +365,8 @@ def test_designs_that_are_not_much_worse_may_take_the_place_of_one_that_fails() 
         return one, SimpleNamespace(prefilter=None), ""
 
     with (
-        patch.object(tune_module, "accepted", accepted),
-        patch.object(tune_module, "judge", lambda loop, controller, analysis: (loop, analysis)),
+        patch.object(acceptance, "accepted", accepted),
+        patch.object(acceptance, "judge", lambda loop, controller, analysis: (loop, analysis)),
         patch.object(tune_module, "_analysis", lambda given, plants, design: design.name),
     ):
         for structure, expected in ((tune_module.SIMPLEST, ["bandwidths", "pid"]), ("pi", [])):
@@ -391,10 +391,10 @@ def test_a_process_that_needs_no_prefilter_may_leave_less_of_the_error() -> None
         return SimpleNamespace(controller=controller, failures=failures, prefilter=prefilter)
 
     with (
-        patch.object(tune_module, "judge", judge),
+        patch.object(acceptance, "judge", judge),
         patch.object(tune_module, "_analysis", lambda *_: None),
         patch.object(
-            tune_module, "quick_without", lambda loop, controller, analysis: controller in quick
+            acceptance, "quick_without", lambda loop, controller, analysis: controller in quick
         ),
     ):
 

@@ -242,6 +242,26 @@ def nonfinite_to_none(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def as_json(result: Any, *names: str, **more: Any) -> dict[str, Any]:
+    """Return attributes of a result, and ``more`` values, by name for ``write_json``.
+
+    Arrays and tuples become lists, results in them dictionaries, and non-finite numbers None.
+    """
+    values = {name: getattr(result, name) for name in names} | more
+    return {name: _as_json(value) for name, value in values.items()}
+
+
+def _as_json(value: Any) -> Any:
+    for method in ("to_json", "_asdict", "tolist"):
+        if hasattr(value, method):
+            return _as_json(getattr(value, method)())
+    if isinstance(value, Mapping):
+        return {key: _as_json(part) for key, part in value.items()}
+    if isinstance(value, tuple | list):
+        return [_as_json(part) for part in value]
+    return nonfinite_to_none(value)
+
+
 def _new_file_beside(target: Path) -> Path:
     if not target.parent.is_dir():
         raise ValueError(f"path = {str(target)!r}: the folder {str(target.parent)!r} must exist")

@@ -26,7 +26,7 @@ from quell.controllers.adrc import ADRC
 from quell.controllers.base import Controller, Limits
 from quell.controllers.law import LinearFeedback
 from quell.controllers.prefilters import without_prefilters
-from quell.files import nonfinite_to_none
+from quell.files import as_json
 from quell.guard import Guard, UnguardedDesign
 from quell.guard.guard import CorrectionGains, gains_of, named_plants
 from quell.learners.base import NoLearner
@@ -118,20 +118,9 @@ class Certificate:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dictionaries for ``json.dump``; None for what is infinite."""
-        found = {
-            "certified": self.certified,
-            "kappa": self.kappa,
-            "gain": self.gain,
-            "output_gain": self.output_gain,
-            "largest_kappa": self.largest_kappa,
-            "error_factor": self.error_factor,
-            "output_factor": self.output_factor,
-            "worst": self.worst,
-            "plants": {name: gains._asdict() for name, gains in self.gains.items()},
-            "excluded": list(self.excluded),
-            "condition": self.condition,
-        }
-        return dict(nonfinite_to_none(found))
+        bounds = ("certified", "kappa", "gain", "output_gain", "largest_kappa", "error_factor")
+        names = (*bounds, "output_factor", "worst", "excluded", "condition")
+        return as_json(self, *names, plants=self.gains)
 
 
 def certify_axis(

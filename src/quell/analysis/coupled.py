@@ -32,7 +32,7 @@ from quell.analysis.certificate import condition_of, guard_bound, guard_samples,
 from quell.analysis.matrices import estimates_at, gain_at, sampled_matrices
 from quell.controllers.adrc import ADRC
 from quell.controllers.axes import Axes
-from quell.files import nonfinite_to_none
+from quell.files import as_json
 from quell.guard.guard import check_one_state_of_f, check_stable, lag_between_samples, state_path
 from quell.lti.models import MatrixSystem, System, peak_gain
 from quell.observers.design import response
@@ -137,20 +137,9 @@ class CoupledCertificate:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dictionaries for ``json.dump``; None for what is infinite."""
-        found = {
-            "certified": self.certified,
-            "axes": list(self.axes),
-            "spectral_radius": self.spectral_radius,
-            "largest_factor": self.largest_factor,
-            "weakest": self.weakest,
-            "gains": self.gains.tolist(),
-            "output_gains": None if self.output_gains is None else self.output_gains.tolist(),
-            "uncertain": self.uncertain.tolist(),
-            "error_factors": self.error_factors.tolist(),
-            "excluded": list(self.excluded),
-            "condition": self.condition,
-        }
-        return dict(nonfinite_to_none(found))
+        known = ("certified", "axes", "spectral_radius", "largest_factor", "weakest")
+        matrices = ("gains", "output_gains", "uncertain", "error_factors")
+        return as_json(self, *known, *matrices, "excluded", "condition")
 
 
 # A spectral radius this close to one is one: the gains are that precise.

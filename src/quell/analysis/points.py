@@ -141,20 +141,12 @@ class LoopsAtPoints:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dictionaries for ``json.dump``; None for what is infinite."""
-        rows = []
+        places, rows = ("inputs", "outputs", "both"), []
         for (x, u), loop, stiffness in zip(self.points, self.loops, self.stiffness, strict=True):
-            rows.append(
-                {
-                    "x": x.tolist(),
-                    "u": u.tolist(),
-                    "stable": loop.stable,
-                    "m_s": loop.m_s("outputs").value,
-                    "disk_margin": {
-                        at: loop.disk_margin(at).alpha for at in ("inputs", "outputs", "both")
-                    },
-                    "stiffness": float(stiffness),
-                }
-            )
+            margins = {at: loop.disk_margin(at).alpha for at in places}
+            about = {"x": x.tolist(), "u": u.tolist(), "stable": loop.stable}
+            about |= {"m_s": loop.m_s("outputs").value, "disk_margin": margins}
+            rows.append({**about, "stiffness": float(stiffness)})
         found: dict[str, Any] = nonfinite_to_none({"points": rows, "verdicts": self.verdicts()})
         return found
 

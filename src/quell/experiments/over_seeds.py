@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from quell import checks
 from quell.controllers.base import check_controller
 from quell.experiments.common import check_sample_times, save_figures
-from quell.files import nonfinite_to_none
+from quell.files import as_json
 from quell.monitoring.rank import decide
 from quell.parallel import in_parallel, part_of
 from quell.plants.base import one_at_a_time, signals_of
@@ -212,23 +212,10 @@ class SeedComparison:
 
     def to_json(self) -> dict[str, Any]:
         """Return all numbers for JSON."""
-        value = {
-            "criterion": self.criterion,
-            "controllers": list(self.names),
-            "axes": list(self.axes),
-            "windows": [list(window) for window in self.windows],
-            "seeds": list(self.seeds),
-            "diverged": self.diverged.tolist(),
-            "rounding": self.rounding.tolist(),
-            "values": {name: array.tolist() for name, array in self.values.items()},
-            "verdicts": [
-                verdict._asdict()
-                | {"best": verdict.best, "pairs": [pair._asdict() for pair in verdict.pairs]}
-                for verdict in self.verdicts
-            ],
-            "report": self.describe().splitlines(),
-        }
-        return dict(nonfinite_to_none(value))
+        given = ("criterion", "axes", "windows", "seeds", "diverged", "rounding", "values")
+        verdicts = [as_json(each, *each._fields, "best") for each in self.verdicts]
+        about = {"controllers": self.names, "report": self.describe().splitlines()}
+        return as_json(self, *given, verdicts=verdicts, **about)
 
 
 # ---- The runs ----

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quell import checks
-from quell.files import nonfinite_to_none
+from quell.files import as_json
 from quell.identification import Measured
 from quell.identification.record_file import in_common_units
 from quell.records.metrics import overshoot, runs_away, worsened
@@ -152,17 +152,8 @@ class Ranking(NamedTuple):
 
     def to_json(self) -> dict[str, Any]:
         """Return all numbers for JSON."""
-        value = {
-            "criterion": self.criterion,
-            "confidence": self.confidence,
-            "best": self.best,
-            "lost": list(self.lost),
-            "scores": {name: scores._asdict() for name, scores in self.scores.items()},
-            "comparisons": [each._asdict() for each in self.comparisons],
-            "worse": self.worse,
-            "notes": list(self.notes),
-        }
-        return dict(nonfinite_to_none(value))
+        names = ("criterion", "confidence", "best", "lost", "scores", "comparisons", "worse")
+        return as_json(self, *names, "notes")
 
 
 def rank(

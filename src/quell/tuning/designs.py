@@ -16,6 +16,7 @@ from quell.controllers.feedforward import Feedforward
 from quell.tuning.constraints import Constraints
 from quell.tuning.optimiser import requirements
 from quell.tuning.optimiser.loops import Inputs, PlantSet, SetResponses, law_of
+from quell.tuning.optimiser.requirements import scores
 from quell.tuning.optimiser.search import (
     FEW,
     Extra,
@@ -334,7 +335,7 @@ def _is_exchanged(task: Task) -> bool:
 def _worst(task: Task, solution: Solution) -> list[int]:
     """Return the plants with the worst objectives."""
     over = SetResponses(task.plants, task.inputs)
-    each = requirements.scores(task.objective, solution.structure, solution.values, over)
+    each = scores(task.objective, solution.structure, solution.values, over)
     found: list[int] = np.argsort(-each)[:_MEMBERS].tolist()
     return found
 
@@ -349,7 +350,7 @@ def _near(task: Task, structure: Structure, start: Solution, rounds: int) -> Sol
     over, members, found = SetResponses(task.plants, task.inputs), list[int](), None
     best = start
     for _ in range(_EXCHANGES):
-        each = requirements.scores(task.objective, structure, best.values, over)
+        each = scores(task.objective, structure, best.values, over)
         if members and float(np.max(each)) <= _WORSE * float(np.max(each[members])):
             break
         members = list(dict.fromkeys([*members, *np.argsort(-each)[:_MEMBERS].tolist()]))

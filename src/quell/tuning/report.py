@@ -29,7 +29,7 @@ from quell.analysis.linearise import linear_law
 from quell.analysis.loop import duration
 from quell.controllers.base import Controller
 from quell.controllers.feedforward import Feedforward
-from quell.files import nonfinite_to_none
+from quell.files import as_json
 from quell.quantities import Signals
 from quell.records.plotting import grid_of_axes, new_figure
 from quell.tuning.constraints import Constraints
@@ -86,29 +86,10 @@ class Design:
 
     def to_json(self) -> dict[str, Any]:
         """Return numbers and texts for a JSON file; infinite numbers become None."""
-        found: dict[str, Any] = nonfinite_to_none(
-            {
-                "name": self.name,
-                "values": dict(self.values),
-                "objective": self.objective,
-                "k_i": self.k_i,
-                "measures": dict(self.measures),
-                "active": [active._asdict() for active in self.active],
-                "least_damped": [
-                    {
-                        "damping": pole.damping,
-                        "omega": abs(pole.s),
-                        "plant": pole.plant,
-                        "own": pole.own,
-                    }
-                    for pole in self.least_damped
-                ],
-                "tables": {key: dict(table) for key, table in self.tables.items()},
-                "undamped": self.undamped,
-                "reason": self.reason,
-            }
-        )
-        return found
+        names = ("name", "values", "objective", "k_i", "measures", "active", "tables", "undamped")
+        own = ("damping", "plant", "own")
+        poles = [as_json(pole, *own, omega=abs(pole.s)) for pole in self.least_damped]
+        return as_json(self, *names, "reason", least_damped=poles)
 
 
 def impossible(name: str, reason: str) -> Design:

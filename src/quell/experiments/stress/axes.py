@@ -87,7 +87,7 @@ from quell.experiments.stress.study import (
     summary,
 )
 from quell.features import RandomFourier
-from quell.files import nonfinite_to_none
+from quell.files import as_json
 from quell.guard import Guard
 from quell.learners import RLS, Harmonic, Learner
 from quell.observers import ESO
@@ -560,19 +560,12 @@ class AxesResult:
             "honest": summary(self.outcomes, AxisErrors),
             "honest_other_noise": summary(self.outcomes, AxisErrors, "chance"),
             "honest_over_unguarded": summary(self.outcomes, AxisErrors, "over_unguarded"),
-            "near_rest": [_rest_to_json(outcome) for outcome in self.rest],
+            "near_rest": [as_json(outcome, *outcome._fields) for outcome in self.rest],
             "structures": {
                 name: summary(each, AxisErrors) for name, each in self.by_structure.items()
             },
             "worst": [outcome.to_json() for outcome in worst],
         }
-
-
-def _rest_to_json(outcome: RestOutcome) -> dict[str, Any]:
-    found: dict[str, Any] = {"features": outcome.features}
-    for name in ("guarded", "unguarded", "plain", "other_noise"):
-        found[name] = nonfinite_to_none(getattr(outcome, name)._asdict())
-    return found
 
 
 def run(

@@ -34,7 +34,7 @@ import numpy as np
 from quell import checks
 from quell.checks import import_extra
 from quell.controllers.base import Controller
-from quell.files import nonfinite_to_none
+from quell.files import as_json
 from quell.parallel import Where, check_sendable, completed, executor_on
 from quell.tuning.simulated.problem import Problem, SearchRange, Space, checked_space, checked_start
 from quell.types import DesignWarning, Matrix, Vector
@@ -329,16 +329,8 @@ class Search:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain dictionaries and lists for ``json.dump``; None for infinite numbers."""
-        rows = [
-            {
-                "number": c.number,
-                "parameters": c.parameters,
-                "values": nonfinite_to_none(c.values),
-                "violation": c.violation,
-                "finished": c.finished,
-            }
-            for c in self.candidates
-        ]
+        names = ("number", "parameters", "values", "violation", "finished")
+        rows = [as_json(each, *names) for each in self.candidates]
         front = [c.number for c in self.front]
         return {"objectives": list(self.objectives), "candidates": rows, "front": front}
 
