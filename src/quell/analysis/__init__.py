@@ -16,7 +16,14 @@ from quell.analysis.feedback import (
 )
 from quell.analysis.linearise import Adapting, Frozen, adapting, frozen, linear_law
 from quell.analysis.loop import LoopAnalysis
-from quell.analysis.machine import OnlineCertificate, analyse, certify, certify_online
+from quell.analysis.machine import (
+    LoopsAtPoints,
+    OnlineCertificate,
+    analyse,
+    analyse_points,
+    certify,
+    certify_online,
+)
 from quell.analysis.margins import Margins
 from quell.analysis.matrices import MatrixLaw, axes_law
 from quell.analysis.multivariable import MultivariableLoop, Peak, Pole
@@ -30,7 +37,6 @@ from quell.analysis.plots import (
     plot_nyquist,
     plot_root_locus,
 )
-from quell.analysis.points import LoopsAtPoints, analyse_points
 from quell.controllers.adrc import Finding
 from quell.lazy import imported_on_use, public_names
 from quell.lti.zeros import (
