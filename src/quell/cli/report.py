@@ -134,13 +134,15 @@ def _span(scores: dict[str, Any]) -> str:
     return f"{scores['start']:g} … {scores['stop']:g}"
 
 
-def print_axes(
-    console: Console, run: Any, setup: Setup
-) -> tuple[dict[str, list[dict[str, Any]]], dict[str, dict[str, float]]]:
-    """Print and return the metrics of each axis and what it learned; print the run's status.
+def print_run(console: Console, run: Any, setup: Setup, title: str) -> tuple[Any, Any]:
+    """Print and return the metrics of a run and what it learned; print the run's status.
 
-    The variation of u of an axis is that of its v.
+    ``title`` is that of one axis. Of several both are by axis; the variation of u is that of its v.
     """
+    if not run.several:
+        windows = windowed_metrics(run, setup)
+        print_metrics(console, title, windows, run.signals)
+        return windows, print_outcome(console, run)
     scores, learned = {}, {}
     for name in run.axis_names:
         axis = run.axis(name)

@@ -453,14 +453,8 @@ def _run(
         return ExitCode.ENDED_BY_SAFETY
     record = run.trajectory
     _print_timing(console, run)
-    scores: Any
-    learned: Any
-    if record.several:
-        scores, learned = report.print_axes(console, record, setup)
-    else:
-        scores = report.windowed_metrics(record, setup)
-        report.print_metrics(console, f"{setup.title}: the scenario", scores, record.signals)
-        learned = report.print_outcome(console, record)
+    title = f"{setup.title}: the scenario"
+    scores, learned = report.print_run(console, record, setup, title)
     code = exit_code(run)
     if watching is not None:
         output.print_line(console, watching.describe())

@@ -36,16 +36,7 @@ from quell.cli.output import (
     write_record,
     write_results,
 )
-from quell.cli.report import (
-    print_axes,
-    print_metrics,
-    print_outcome,
-    print_summary,
-    save_run_figure,
-    stored_alike,
-    summary,
-    windowed_metrics,
-)
+from quell.cli.report import print_run, print_summary, save_run_figure, stored_alike, summary
 
 if TYPE_CHECKING:
     from quell.export import Comparison, Exported
@@ -88,7 +79,6 @@ def run(
     if setup is None:
         raise ValueError("setup: missing; must be a TOML file, and quell run --example prints one")
     name, data = read(setup)
-    several = is_of_axes(data)
     given = made(name, data, trust)
     plant, scenario = given.needed("plant"), given.needed("scenario")
     outputs = check_outputs(outputs, [setup.stem])
@@ -99,17 +89,10 @@ def run(
             result = simulate(plant, given.controller, scenario, progress=progress)
         except ValueError as error:
             raise SetupError([f"{given.file}: {error}"]) from None
-    scores: Any
-    learned: Any
-    if several:
-        signals = signals_in(given.description, given.controller)
-        result = replace(result, signals=signals) if signals.known else result
-        scores, learned = print_axes(console, result, given)
-    else:
-        scores = windowed_metrics(result, given)
-        title = f"{given.title}: {result.plant}, dt = {result.dt:g} s"
-        print_metrics(console, title, scores, result.signals)
-        learned = print_outcome(console, result)
+    if is_of_axes(data) and (signals := signals_in(given.description, given.controller)).known:
+        result = replace(result, signals=signals)
+    title = f"{given.title}: {result.plant}, dt = {result.dt:g} s"
+    scores, learned = print_run(console, result, given, title)
     paths = save_run_figure(result, given.title, outputs, setup.stem)
     write_record(console, result, outputs, "Record")
     alone = _without_learner(console, given, data, result)
@@ -358,15 +341,9 @@ def _repeat(
     outputs = check_outputs(outputs, [name])
     with progress_bar(console, COMPILING) as report:
         run = simulate(*parts, progress=partial(report, COMPILING))
-    of_run = replace(given, scenario=parts.scenario, plant=parts.plant)
-    scores: Any
-    learned: Any
-    if hasattr(parts.controller, "inputs"):
-        scores, learned = print_axes(console, run, replace(of_run, title=f"{given.title}, {text}"))
-    else:
-        scores = windowed_metrics(run, of_run)
-        print_metrics(console, f"{given.title}, {text}", scores)
-        learned = print_outcome(console, run)
+    title = f"{given.title}, {text}"
+    of_run = replace(given, scenario=parts.scenario, plant=parts.plant, title=title)
+    scores, learned = print_run(console, run, of_run, title)
     same = stored_alike(folder, number, text, run, arguments["metrics"])
     if same is not None:
         print_line(console, f"In {folder}/: {'the same, bit for bit' if same else 'other values'}.")
