@@ -190,7 +190,7 @@ def test_what_the_bounds_do_not_cover_is_said() -> None:
     assert found.certified
     assert found.spectral_radius < 1e-2
     assert len(found.excluded) == 4
-    assert str(found).splitlines()[-1].startswith("not covered: times when an actuator is limited;")
+    assert str(found).splitlines()[-1].startswith("not covered: times when u is limited;")
     plain = certify(inertias(np.eye(2)), ql.Axes([axis(), axis()]))
     assert plain.excluded == ()
     assert "not covered" not in str(plain)

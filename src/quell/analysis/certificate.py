@@ -15,15 +15,16 @@ The error q of the plain observer in a record: what certificates are about.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.controllers.adrc import ADRC
-from quell.controllers.base import Controller, Limits
+from quell.controllers.base import Controller
 from quell.controllers.law import LinearFeedback
 from quell.controllers.prefilters import without_prefilters
 from quell.files import as_json
@@ -32,6 +33,7 @@ from quell.guard.guard import CorrectionGains, gains_of, named_plants
 from quell.learners.base import NoLearner
 from quell.observers.design import f_learned_response, response
 from quell.observers.forms import state_for, without_delay
+from quell.plants.channels import DelayedInputs, EncodedOutputs
 from quell.plants.flexible import CubicSpringPlant
 from quell.plants.linear import DelayedPlant, EncodedPlant, sampled_plant
 from quell.plants.linearise import linear_part
@@ -141,9 +143,9 @@ def certify_axis(
         gains[name] = gains_of(
             name, sampled, adrc.observer, adrc.parameters.law, guard_samples(adrc)
         )
-        excluded += _not_covered(plant, adrc.parameters.limits)
-    not_covered = tuple(dict.fromkeys(excluded))
-    return Certificate(guard_bound(adrc), gains, not_covered, condition_of({"": adrc}))
+        excluded += not_covered(plant, adrc.parameters.limits)
+    without = tuple(dict.fromkeys(excluded))
+    return Certificate(guard_bound(adrc), gains, without, condition_of({"": adrc}))
 
 
 def linear_adrc(controller: Controller) -> ADRC:
@@ -186,11 +188,15 @@ def condition_of(axes: Mapping[str, ADRC]) -> str:
     return f"NOT guarded{': ' * any(free)}{', '.join(free)}: holds with guard=Guard()"
 
 
-def _not_covered(plant: Any, limits: Limits) -> list[str]:
-    """Return what of the loop of ``plant``, as the user gave it, is not covered."""
-    found = [] if all(map(math.isinf, limits)) else ["times when u is limited"]
-    while isinstance(plant, DelayedPlant | EncodedPlant):
-        if isinstance(plant, EncodedPlant):
+def not_covered(plant: Any, limits: Iterable[ArrayLike]) -> list[str]:
+    """Return what of the loop of ``plant``, as the user gave it, is not covered.
+
+    ``limits`` are those of the control signals, of their sizes and of their rates.
+    """
+    limited = any(np.any(np.isfinite(part)) for part in limits)
+    found = ["times when u is limited"] if limited else []
+    while isinstance(plant, DelayedPlant | DelayedInputs | EncodedPlant | EncodedOutputs):
+        if isinstance(plant, EncodedPlant | EncodedOutputs):
             found.append("the encoder's steps (they count as noise, the same in both loops)")
         plant = plant.plant
     if isinstance(plant, NonlinearPlant | CubicSpringPlant):

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from quell import checks
-from quell.analysis.certificate import condition_of, guard_bound, guard_samples, linear_adrc
+from quell.analysis import certificate
 from quell.analysis.matrices import estimates_at, gain_at, sampled_matrices
 from quell.controllers.adrc import ADRC
 from quell.controllers.axes import Axes
@@ -36,8 +36,6 @@ from quell.files import as_json
 from quell.guard.guard import check_one_state_of_f, check_stable, lag_between_samples, state_path
 from quell.lti.models import MatrixSystem, System, peak_gain
 from quell.observers.design import response
-from quell.plants.channels import DelayedInputs, EncodedOutputs
-from quell.plants.nonlinear import NonlinearPlant
 from quell.types import Matrix, Vector
 
 
@@ -238,29 +236,17 @@ def certify_axes(plant: Any, axes: Axes, operating_point: Any = None) -> Coupled
     κ of each axis is that of its guard, or of ``Guard()`` if it has none; ``condition`` names the
     axes that learn without guard, for which the bounds do not hold.
     """
-    adrcs = [linear_adrc(each) for each in axes.unit_axes]
+    adrcs = [certificate.linear_adrc(each) for each in axes.unit_axes]
     matrices = sampled_matrices(plant, axes.dt, operating_point)
     inverse = gain_at(axes, estimates_at(axes, plant, operating_point))[1]
     to_error, to_output = coupled_loop(matrices, adrcs, inverse)
-    kappa = [guard_bound(adrc) for adrc in adrcs]
+    kappa = [certificate.guard_bound(adrc) for adrc in adrcs]
     found = certify_coupled(to_error, kappa, to_output, axes.names)
-    condition = condition_of(dict(zip(axes.names, adrcs, strict=True)))
-    return replace(found, excluded=_not_covered(plant, axes), condition=condition)
-
-
-def _not_covered(plant: Any, axes: Axes) -> tuple[str, ...]:
-    """Return what of the loop, as the user gave it, is not covered."""
-    limits = np.concatenate([np.ravel(part) for part in axes.limits])
-    found = ["times when an actuator is limited"] if np.any(np.isfinite(limits)) else []
-    while isinstance(plant, DelayedInputs | EncodedOutputs):
-        if isinstance(plant, EncodedOutputs):
-            found.append("the encoders' steps (they count as noise, the same in both loops)")
-        plant = plant.plant
-    if isinstance(plant, NonlinearPlant):
-        found.append("large motions (the plant is linearised)")
+    condition = certificate.condition_of(dict(zip(axes.names, adrcs, strict=True)))
+    excluded = certificate.not_covered(plant, axes.limits)
     if callable(axes.B0) or callable(axes.M):
-        found.append("changes of B0 with the estimates")
-    return tuple(found)
+        excluded.append("changes of B0 with the estimates")
+    return replace(found, excluded=tuple(excluded), condition=condition)
 
 
 def coupled_loop(
@@ -309,7 +295,7 @@ def _axis(adrc: ADRC) -> MatrixSystem:
     check_one_state_of_f(observer)
     n, estimates = observer.order, observer.estimates
     whole = response(observer.model, estimates, n)
-    M, g, c, d = lag_between_samples(observer, guard_samples(adrc))
+    M, g, c, d = lag_between_samples(observer, certificate.guard_samples(adrc))
     path = state_path(observer, law)
     check_stable(path, "the observer's answer to a correction")
     # The state: observer, v before, lag filter of f_plain, its output f_plain^F, path of e_L.

@@ -12,7 +12,7 @@ so that the responses are ``r → y: P C_r S``, ``d → y: P S``, ``n → u: −
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any
 
@@ -21,13 +21,7 @@ from numpy.typing import ArrayLike
 
 from quell import checks
 from quell.analysis.certificate import Certificate, certify_axis
-from quell.analysis.linearise import (
-    Frozen,
-    is_known,
-    knows_other_axes,
-    linear_law,
-    within_noise,
-)
+from quell.analysis.linearise import Frozen, is_known, knows_other_axes, linear_law, within_noise
 from quell.analysis.margins import (
     Complex,
     Margins,
@@ -42,6 +36,7 @@ from quell.checks import import_extra
 from quell.controllers.adrc import ADRC
 from quell.controllers.base import Controller
 from quell.controllers.compensated import compensating_part
+from quell.controllers.compensator import Compensator
 from quell.controllers.linear import LinearLaw
 from quell.controllers.prefilters import without_prefilters
 from quell.learners.base import NoLearner
@@ -196,21 +191,12 @@ def analyse_axis(
         certificate = partial(
             certify_axis, plant, controller, operating_point=operating_point, **how
         )
-    law, note = linear_law(controller, at), ""
-    part = compensating_part(controller)
-    if part is not None and not isinstance(at, Frozen):
-        design = part.parameters.learner
-        if not is_known(design):
-            name = type(part.learner).__name__
-            note = f"NOT in these margins: how {name} adapts; measure it (docs/analysis_learners)"
-        elif knows_other_axes(part):
-            note = "NOT in these margins: what the learner has learned from states of all axes"
+    law, part = linear_law(controller, at), compensating_part(controller)
+    lines = [] if part is None or isinstance(at, Frozen) else not_in_margins({"": part})
     learners = [] if part is None else [part.learner]
-    ratios = [] if b_over_b0 is None else [b_over_b0]
-    note = "\n".join(filter(None, [note, *about_learning(learners, ratios)]))
-    found, hidden = LoopAnalysis(sampled, law, dt, b_over_b0, certificate, note), None
-    if part is not None:
-        hidden = within_noise(controller, at)
+    lines += about_learning(learners, [] if b_over_b0 is None else [b_over_b0])
+    found = LoopAnalysis(sampled, law, dt, b_over_b0, certificate, "\n".join(lines))
+    hidden = None if part is None else within_noise(controller, at)
     if hidden is not None:
         alone = LoopAnalysis(sampled, linear_law(controller, hidden), dt)
         found.without_learned = type(learners[0]).__name__, alone
@@ -223,6 +209,24 @@ def assumed_of(names: str, left: str) -> str:
         f"assumed of {names}: all signals move by more than the noise. One that does not is not "
         f"fed back; with nothing fed back of what was learned of the state and u {left}"
     )
+
+
+def not_in_margins(parts: Mapping[str, Compensator]) -> list[str]:
+    """Return a line on what of the learners of a loop its margins do not have, by name of axis."""
+    lines = []
+    for name, part in parts.items():
+        if not is_known(part.parameters.learner):
+            which = f"{type(part.learner).__name__}{' of ' * bool(name)}{name}"
+            how = f"how {which} adapts; measure it (docs/analysis_learners)"
+            lines.append(f"NOT in these margins: {how}")
+    knowing = [name for name, part in parts.items() if knows_other_axes(part)]
+    if knowing:
+        lines.append(
+            "NOT in these margins: what learners have learned from states of all axes"
+            f"{', in ' * any(knowing)}{', '.join(knowing)}; their biases are. Analyse new axes, "
+            "and simulate the loop with what was learned"
+        )
+    return lines
 
 
 def about_learning(learners: Sequence[Any], ratios: ArrayLike) -> list[str]:

@@ -39,8 +39,8 @@ from numpy.typing import NDArray
 
 from quell import checks
 from quell.analysis.disk import DiskMargin, factors_of, largest_scaled, singular, worst_change
-from quell.analysis.linearise import is_known, knows_other_axes, within_noise
-from quell.analysis.loop import about_learning, assumed_of, duration
+from quell.analysis.linearise import within_noise
+from quell.analysis.loop import about_learning, assumed_of, duration, not_in_margins
 from quell.analysis.margins import (
     Complex,
     Margins,
@@ -489,7 +489,13 @@ def analyse_axes(plant: Any, axes: Axes, operating_point: Any = None) -> Multiva
         )
     law = law_of_axes(axes, estimates_at(axes, plant, operating_point))
     loop = MultivariableLoop(matrices, law, axes.dt, outputs=axes.names)
-    lines = not_in_margins(axes)
+    lines = []
+    if axes.takes_u_0:
+        lines.append(
+            "NOT in these margins: the loop that u_0 closes; give its controllers to Axes as "
+            "drives, or analyse them on the plant with these compensators"
+        )
+    lines += not_in_margins(dict(zip(axes.names, axes.axes, strict=True)))
     learners = [axis.learner for axis in axes.axes]
     lines += about_learning(learners, gain_ratios(plant, axes, operating_point))
     gated = [
@@ -509,33 +515,6 @@ def analyse_axes(plant: Any, axes: Axes, operating_point: Any = None) -> Multiva
         )
     loop.remark = "\n".join(lines)
     return loop
-
-
-def not_in_margins(axes: Axes) -> list[str]:
-    """Return a line on each part of a loop with these axes that its margins do not have."""
-    lines = []
-    if axes.takes_u_0:
-        lines.append(
-            "NOT in these margins: the loop that u_0 closes; give its controllers to Axes as "
-            "drives, or analyse them on the plant with these compensators"
-        )
-    for name, axis in zip(axes.names, axes.axes, strict=True):
-        if not is_known(axis.parameters.learner):
-            kind = type(axis.learner).__name__
-            lines.append(
-                f"NOT in these margins: how {kind} of {name} adapts; measure it "
-                "(docs/analysis_learners)"
-            )
-    knowing = [
-        name for name, axis in zip(axes.names, axes.axes, strict=True) if knows_other_axes(axis)
-    ]
-    if knowing:
-        lines.append(
-            "NOT in these margins: what learners have learned from states of all axes, in "
-            f"{', '.join(knowing)}; their biases are. Analyse new axes, and simulate the loop with "
-            "what was learned"
-        )
-    return lines
 
 
 def _channel_names(

@@ -36,7 +36,14 @@ from quell.cli.output import (
     write_record,
     write_results,
 )
-from quell.cli.report import print_run, print_summary, save_run_figure, stored_alike, summary
+from quell.cli.report import (
+    print_run,
+    print_summary,
+    save_run_figure,
+    stored_alike,
+    summary,
+    windowed_metrics,
+)
 
 if TYPE_CHECKING:
     from quell.export import Comparison, Exported
