@@ -701,19 +701,13 @@ def replay(
         replayed = replay_record(recorded, given.controller, channels=names)
     except ValueError as error:
         raise with_path(given.file, "", error, ()) from None
-    part = controlled(recorded)
-    scores: Any
-    learned: Any
-    if several:
-        title = f"{record.name} through {given.title}"
-        scores, learned = {}, {}
-        for axis in replayed.axis_names:
-            pair = recorded.axis(replayed.axis_names.index(axis)), replayed.axis(axis)
-            scores[axis] = _print_scores(console, f"{title}: {axis}", *pair, part)
-            learned[axis] = report.print_outcome(console, pair[1])
-    else:
-        title = f"{record.name} through {given.title}"
-        scores = _print_scores(console, title, recorded, replayed, part)
+    part, title = controlled(recorded), f"{record.name} through {given.title}"
+    scores: dict[str, Any] = {}
+    learned: dict[str, Any] = {}
+    for i, axis in enumerate(replayed.axis_names if several else ("",)):
+        pair = (recorded.axis(i), replayed.axis(axis)) if several else (recorded, replayed)
+        scores[axis] = _print_scores(console, f"{title}{': ' * several}{axis}", *pair, part)
+        learned[axis] = report.print_outcome(console, pair[1])
     _print_gaps(console, recorded)
     apart = (replayed["u_wished"] - replayed["u"])[part]
     each_u = [metrics.rms(u) for u in apart.reshape(len(apart), -1).T]
@@ -723,8 +717,6 @@ def replay(
         f"Wished u less applied u, RMS: {text}. Judged: the {part.stop - part.start} "
         "samples under control."
     )
-    if not several:
-        learned = report.print_outcome(console, replayed)
     draw = None if several else _draw_wished
     paths = report.save_run_figure(replayed, given.title, outputs, name, draw)
     output.write_record(console, replayed, outputs, "Replay")
@@ -732,9 +724,9 @@ def replay(
         "record": str(record),
         "title": given.title,
         "dt": recorded.dt,
-        "scores": scores,
+        "scores": scores if several else scores[""],
         "u_wished_rms": difference,
-        "learned": learned,
+        "learned": learned if several else learned[""],
         "setup": given.as_json(),
     }
     output.write_results(console, results, outputs, paths)
