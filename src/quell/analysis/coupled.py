@@ -110,8 +110,7 @@ class CoupledCertificate:
             raise ValueError(f"q_0 = {q_0.tolist()!r}: must not be negative, it is a supremum")
         if not self.certified:
             return np.full(factors.shape[0], math.inf)
-        bound: Vector = factors @ q_0
-        return bound
+        return factors @ q_0
 
     def __str__(self) -> str:
         rho = f"ρ(ΓK) = {self.spectral_radius:.3g}"
@@ -147,8 +146,7 @@ _ROUNDING = 1e-12
 def _perron(M: Matrix) -> Vector:
     """Return the sizes of the eigenvector of the largest eigenvalue of a matrix ≥ 0."""
     values, vectors = np.linalg.eig(M)
-    found: Vector = np.abs(vectors[:, np.argmax(np.abs(values))])
-    return found
+    return np.abs(vectors[:, np.argmax(np.abs(values))])
 
 
 def certify_coupled(

@@ -400,8 +400,7 @@ def _first_pulses(A: Matrix, B: Matrix, C: Matrix) -> Matrix:
     rows = start.min(axis=1)
     late = (start - rows[:, None]).min(axis=0)
     at = np.minimum(rows[:, None] + late, never - 1)
-    found: Matrix = np.array([[pulses[at[i, j]][i, j] for j in range(m)] for i in range(p)])
-    return found
+    return np.array([[pulses[at[i, j]][i, j] for j in range(m)] for i in range(p)])
 
 
 def _is_singular(gains: GainsAt) -> bool:

@@ -28,7 +28,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from quell.analysis.margins import Complex
 from quell.types import Vector
@@ -251,5 +250,4 @@ def largest_scaled(
 
 def singular(values: Complex) -> Vector:
     """Return the largest singular values (k,) of matrices (k, p, m)."""
-    found: NDArray[np.float64] = np.linalg.norm(values, 2, axis=(1, 2))
-    return found
+    return np.linalg.norm(values, 2, axis=(1, 2))

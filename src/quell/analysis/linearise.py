@@ -180,8 +180,7 @@ def frozen(controller: Controller, run: Any = None, t: float | None = None) -> F
 
 def _learning_state(state: Any) -> AdrcState:
     """Return the state of observer, learner and guard within that of a controller."""
-    inner: AdrcState = state.compensator if isinstance(state, CompensatedState) else state
-    return inner
+    return state.compensator if isinstance(state, CompensatedState) else state
 
 
 def _from_record(controller: Compensator, run: Trajectory, t: float) -> Frozen:
@@ -261,8 +260,7 @@ def knows_other_axes(controller: Compensator) -> bool:
 
     def output(now: Vector) -> tuple[float, float]:
         memory.now[:] = now
-        found: tuple[float, float] = predict(learner, copy_state(memory), seen, known.u)
-        return found
+        return predict(learner, copy_state(memory), seen, known.u)
 
     # Numbers without a pattern: a product of states is not zero at them. Own states are written
     # over them.
@@ -604,11 +602,9 @@ def linear_law(controller: Controller, at: Any = None) -> LinearLaw:
         of the controller (its end); by default the present state.
     """
     if at is not None and hasattr(controller, "law_at"):
-        with_frequencies: LinearLaw = controller.law_at(getattr(at, "final_state", at))
-        return with_frequencies
+        return controller.law_at(getattr(at, "final_state", at))
     if hasattr(controller, "law"):
-        given: LinearLaw = controller.law
-        return given
+        return controller.law
     if not isinstance(controller, Compensator | Compensated):
         raise ValueError(
             f"controller = {controller!r}: must be an ADRC, a compensator or a linear controller"

@@ -361,8 +361,7 @@ class LoopAnalysis(InNotebook):
     @cached_property
     def poles(self) -> Complex:
         """Closed-loop poles in the z-plane, the slowest first."""
-        poles: Complex = 1.0 + self._shifted
-        return poles
+        return 1.0 + self._shifted
 
     @cached_property
     def s_poles(self) -> Complex:

@@ -453,8 +453,7 @@ class LoopsAtPoints:
             about = {"x": x.tolist(), "u": u.tolist(), "stable": loop.stable}
             about |= {"m_s": loop.m_s("outputs").value, "disk_margin": margins}
             rows.append({**about, "stiffness": float(stiffness)})
-        found: dict[str, Any] = nonfinite_to_none({"points": rows, "verdicts": self.verdicts()})
-        return found
+        return nonfinite_to_none({"points": rows, "verdicts": self.verdicts()})
 
 
 def analyse_points(plant: Any, axes: Axes, points: Sequence[Any]) -> LoopsAtPoints:

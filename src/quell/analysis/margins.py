@@ -226,8 +226,7 @@ class Response:
                 "them, a pole; leave it out"
             ) from None
         if not self._one:
-            found: Complex = output @ solved + self._D
-            return found
+            return output @ solved + self._D
         # A third of the time of the matrix product, and tuning asks for little else.
         row, column = output[..., 0, :], solved[:, :, 0]
         product = column @ row if row.ndim == 1 else np.sum(column * row, axis=1)
@@ -278,8 +277,7 @@ def balancing_scales(N: Matrix, M: NDArray[np.float64]) -> Vector:
 
     size = np.abs(N) + np.sum(np.abs(M), axis=0)
     _, (scale, _) = matrix_balance(size, permute=False, separate=True)
-    balance: Vector = scale
-    return balance
+    return scale
 
 
 def in_s_plane(shifted: Complex, dt: float) -> Complex:
@@ -291,8 +289,7 @@ def in_s_plane(shifted: Complex, dt: float) -> Complex:
             0.5 * np.log1p(2.0 * shifted.real + np.abs(shifted) ** 2),
         )
     angle = np.where(np.isinf(size), 0.0, np.angle(1.0 + shifted))
-    s: Complex = size / dt + 1j * (angle / dt)
-    return s
+    return size / dt + 1j * (angle / dt)
 
 
 def frequencies(poles: Complex, dt: float) -> Vector:
@@ -307,8 +304,7 @@ def frequencies(poles: Complex, dt: float) -> Vector:
         away = damping * _BESIDE_DAMPED if damping > 1e-6 * center else center * _BESIDE_UNDAMPED
         grid += [center - away, center + away]
     omega = np.unique(np.concatenate(grid))
-    kept: Vector = omega[(omega >= bottom) & (omega <= top)]
-    return kept
+    return omega[(omega >= bottom) & (omega <= top)]
 
 
 # ---- Stability margins of a loop from its frequency response ----

@@ -237,8 +237,7 @@ def joined(laws: Sequence[LinearLaw], inverse: Matrix) -> MatrixLaw:
     from scipy.linalg import block_diag
 
     def whole(of: Callable[[LinearLaw], Any]) -> Matrix:
-        found: Matrix = block_diag(*(of(law) for law in laws))
-        return found
+        return block_diag(*(of(law) for law in laws))
 
     return MatrixLaw(
         A=whole(lambda law: law.A + np.outer(law.B_u, law.C)),

@@ -305,8 +305,7 @@ class MultivariableLoop:
 
     def _sensitivity(self, omega: Vector) -> Complex:
         G = self._response(omega, self.dt)
-        found: Complex = np.eye(G.shape[1]) + G * (self._size / self._size[:, None])
-        return found
+        return np.eye(G.shape[1]) + G * (self._size / self._size[:, None])
 
     def response(self, name: str, omega: Any) -> Complex:
         """Return a frequency response (k, rows, columns), in the user's units.
@@ -433,8 +432,7 @@ class MultivariableLoop:
         shift = 0.5 * (skew - 1.0) * np.eye(count)
 
         def shifted(omega: Vector) -> Complex:
-            found: Complex = self._sensitivity(omega)[:, part, part] + shift
-            return found
+            return self._sensitivity(omega)[:, part, part] + shift
 
         omega, values = self._grid
         values = values[:, part, part] + shift

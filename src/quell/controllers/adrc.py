@@ -390,8 +390,7 @@ class ADRC(Compensator):
     @property
     def gains(self) -> Vector:
         """Gains k (n,) of the law."""
-        law: Vector = self.parameters.law
-        return law
+        return self.parameters.law
 
     @property
     def derivatives(self) -> int:

@@ -349,8 +349,7 @@ class Feedforward:
 
     def _of_y(self, series: Vector) -> Vector:
         """Return a series in derivatives of y as one in those of r, up to the same power."""
-        found: Vector = np.convolve(series, self.numerator)[: series.size]
-        return found
+        return np.convolve(series, self.numerator)[: series.size]
 
 
 def polynomials(plant: Canonical, highest: int) -> tuple[Vector, Vector]:

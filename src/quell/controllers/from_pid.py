@@ -127,8 +127,7 @@ class PidEqual(NamedTuple):
         elif sampled == "tustin":
             s = 2j / dt * np.tan(0.5 * omega * dt)
         f1, f2 = self.filter
-        found: Complex = np.polyval(self.numerator, s) / (s * np.polyval([f2, f1, 1.0], s))
-        return found
+        return np.polyval(self.numerator, s) / (s * np.polyval([f2, f1, 1.0], s))
 
     def difference(self, omega: Any, sampled: str = "tustin") -> Vector:
         """Return the relative difference of ADRC and PID controller, ``|C − C'|/|C'|``, by omega.
@@ -141,8 +140,7 @@ class PidEqual(NamedTuple):
             how the PID controller is sampled, as for ``pid_response``.
         """
         other = self.pid_response(omega, sampled)
-        found: Vector = np.abs(self.response(omega) - other) / np.abs(other)
-        return found
+        return np.abs(self.response(omega) - other) / np.abs(other)
 
     def bound(self, plant: Any, sampled: str = "tustin") -> float:
         """Return by how much y may differ in a loop, as a share of the RMS value of y.
@@ -479,8 +477,7 @@ def _pattern(poles: NDArray[Any]) -> tuple[float, Pattern]:
 
 def _gains(law_poles: Any, omega_c: float) -> Vector:
     """Return k_1 … k_n of a law with these poles."""
-    found: Vector = np.real(np.poly(omega_c * _complex(law_poles)))[:0:-1].astype(np.float64)
-    return found
+    return np.real(np.poly(omega_c * _complex(law_poles)))[:0:-1].astype(np.float64)
 
 
 def _complex(pattern: Any) -> Complex:
@@ -531,8 +528,7 @@ def _frequencies(omega: Any) -> Vector:
 
 
 def _grid(low: float, high: float, count: int) -> Vector:
-    found: Vector = np.geomspace(low, high, count)
-    return found
+    return np.geomspace(low, high, count)
 
 
 def _percent(share: float) -> str:

@@ -133,8 +133,7 @@ class Wrapper(StatefulController):
     @property
     def limits(self) -> Limits:
         """Limits of the control signal."""
-        limits: Limits = self.controller.limits
-        return limits
+        return self.controller.limits
 
     @property
     def external_signals(self) -> int:
@@ -171,8 +170,7 @@ class Wrapper(StatefulController):
     @property
     def channels(self) -> Channels:
         """Name and width of what ``write_row`` writes, in order."""
-        channels: Channels = self.controller.channels
-        return channels
+        return self.controller.channels
 
     @property
     def status(self) -> Status:

@@ -511,8 +511,7 @@ def _moved_by_f(observer: ESO, time: float) -> Vector:
     A[: n - 1, 1:n] = np.eye(n - 1)
     A[n - 1, :n] = -observer.cancel
     A[n - 1, n] = 1.0
-    found: Vector = expm(A * time)[:, -1]
-    return found
+    return expm(A * time)[:, -1]
 
 
 __all__ = ["SafeSet"]

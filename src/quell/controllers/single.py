@@ -384,8 +384,7 @@ class SinglePrecision(Wrapper):
         self._inner.start(y, rest if u is None else u, r)
 
     def _images(self) -> Layout:
-        images: Layout = self._acting._images()
-        return images
+        return self._acting._images()
 
     @property
     def _inner(self) -> Any:

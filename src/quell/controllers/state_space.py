@@ -190,8 +190,7 @@ def state_feedback(A: Any, B: Any, omega_c: float, dt: float) -> Matrix:
             "move all states (leave out those that it does not), and dt must not be a period of "
             "an undamped mode"
         )
-    found: Matrix = gain.T * units[None, :]
-    return found
+    return gain.T * units[None, :]
 
 
 def quadratic_feedback(A: Any, B: Any, state_weight: Any, control_weight: Any, dt: float) -> Matrix:
@@ -240,8 +239,7 @@ def quadratic_feedback(A: Any, B: Any, state_weight: Any, control_weight: Any, d
         )
     # The filter's gain L corrects after the prediction; the law acts before it: K = (Φᵀ L)ᵀ.
     gain = transition @ gains.kalman_gain_of(found[0], inputs, R, np.ones(m, dtype=bool))
-    law: Matrix = (gain * units[:, None]).T
-    return law
+    return (gain * units[:, None]).T
 
 
 def _equilibrated(matrix: Matrix) -> tuple[Matrix, Matrix]:

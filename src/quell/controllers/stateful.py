@@ -167,10 +167,7 @@ def entry_point(dispatcher: Any, packed: PackedController) -> Callable[[Any, flo
     """
     if dispatch.interpret_all:
         return _step_as_python
-    compiled: Callable[[Any, float, float], float] = dispatcher.compile(
-        (packed.type, nb_types.float64, nb_types.float64)
-    )
-    return compiled
+    return dispatcher.compile((packed.type, nb_types.float64, nb_types.float64))
 
 
 def _step_as_python(packed: Any, r: float, y: float) -> float:
@@ -195,8 +192,7 @@ def changing(dispatcher: Any, packed: PackedController) -> Callable[[Any, Any], 
     """Return the compiled function of ``dispatcher`` for controllers of one type."""
     if dispatch.interpret_all:
         return lambda old, new: change_parameters(old.arrays[0], *new.arrays)
-    compiled: Callable[[Any, Any], None] = dispatcher.compile((packed.type, packed.type))
-    return compiled
+    return dispatcher.compile((packed.type, packed.type))
 
 
 class Retuning(NamedTuple):

@@ -213,8 +213,7 @@ class Driven:
 
     def shaped(self, actions: Any) -> Vector:
         """Return actions as ``advance`` takes them; they have the right size."""
-        made: Vector = actions.reshape(self.loops.count, self.actions)
-        return made
+        return actions.reshape(self.loops.count, self.actions)
 
     @property
     def action_names(self) -> tuple[str, ...]:

@@ -469,14 +469,12 @@ def _rounding(
 
 def _has_ratio(values: NDArray[np.float64], rounding: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return in which axes no criterion of ``values`` (controllers, axes, seeds) is rounding."""
-    found: NDArray[np.bool_] = ~np.any(values <= rounding[:, None], axis=(0, 2))
-    return found
+    return ~np.any(values <= rounding[:, None], axis=(0, 2))
 
 
 def _logarithms(values: NDArray[np.float64], rounding: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the logarithms of a criterion; what is rounding is all the same."""
-    logarithms: NDArray[np.float64] = np.log(np.maximum(values, rounding[:, None]))
-    return logarithms
+    return np.log(np.maximum(values, rounding[:, None]))
 
 
 def _verdicts(

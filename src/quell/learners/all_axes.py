@@ -382,8 +382,7 @@ class SeeingLearner:
 
     def feature_names(self, order: int) -> tuple[str, ...]:
         """Return the names of the features that θ multiplies."""
-        names: tuple[str, ...] = self.bound.feature_names(order)
-        return names
+        return self.bound.feature_names(order)
 
 
 # ---- One learner that serves all axes ----

@@ -309,8 +309,7 @@ class Online(FeatureLearner):
 
     def fitted_model(self, observer: ESO, omega_c: float) -> Model:
         """Return the model with the parameters that depend on observer and controller."""
-        model: Model = self.model
-        return model
+        return self.model
 
     def design(self, observer: ESO, omega_c: float) -> OnlineDesign:
         """Return the parameters for an observer and the controller's bandwidth [rad/s]."""

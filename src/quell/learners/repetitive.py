@@ -333,5 +333,4 @@ def correction_weights(observer: ESO, lag: Any) -> Vector:
         pulse[i] = lag_push(lag, memory, 0, 1.0 if i == 0 else 0.0)
     angle = np.linspace(0.0, math.pi, count // 2 + 1)
     sharpened = (1.0 + share * (2.0 - 2.0 * np.cos(angle))) ** power
-    found: Vector = weights / np.max(sharpened * np.abs(np.fft.rfft(pulse)) ** 2)
-    return found
+    return weights / np.max(sharpened * np.abs(np.fft.rfft(pulse)) ** 2)

@@ -217,8 +217,7 @@ def _zeros(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> InvariantZeros:
         """Return the scaled P(s), with s in scaled units of time."""
         shift = np.zeros((n + p, n + m))
         shift[:n, :n] = np.eye(n)
-        whole: Complex = pencil - s * shift
-        return whole
+        return pencil - s * shift
 
     def smallest(s: complex) -> float:
         values = np.linalg.svd(at(s), compute_uv=False)
@@ -317,8 +316,7 @@ def _null_vector(P: Complex) -> Complex:
     """Return the right singular vector of the smallest singular value, its largest entry real."""
     vector: Complex = np.linalg.svd(P)[2][-1].conj()
     largest = vector[np.argmax(np.abs(vector))]
-    turned: Complex = vector * (abs(largest) / largest)
-    return turned
+    return vector * (abs(largest) / largest)
 
 
 def _largest(vector: Complex) -> tuple[int, ...]:

@@ -291,16 +291,14 @@ def _common_sample_time(tunings: Mapping[str, list[Measured]]) -> float:
 def _loss(log: Measured, criterion: str) -> Vector:
     """Return the loss in each sample (N,)."""
     if criterion == "effort":
-        rates: Vector = np.abs(np.diff(log.u, prepend=log.u[0])) / log.dt
-        return rates
+        return np.abs(np.diff(log.u, prepend=log.u[0])) / log.dt
     error = _error(log)
     return error**2 if criterion == "rms" else np.abs(error)
 
 
 def _error(log: Measured) -> Vector:
     """Return r − y in each sample (N,)."""
-    error: Vector = np.asarray(log.reference, dtype=np.float64) - log.y
-    return error
+    return np.asarray(log.reference, dtype=np.float64) - log.y
 
 
 def _scores(logs: list[Measured], batches: int) -> Scores:
@@ -373,8 +371,7 @@ class _Batches:
 def batch_means(values: Vector, length: int) -> Vector:
     """Return the means of batches of ``length`` samples; what is left at the end is left out."""
     count = values.size // length
-    means: Vector = values[: count * length].reshape(count, length).mean(axis=1)
-    return means
+    return values[: count * length].reshape(count, length).mean(axis=1)
 
 
 def correlation_time(values: Vector) -> float:
@@ -452,8 +449,7 @@ def _without_cycle(values: Vector, period: int) -> Vector:
     if count < 2:
         return values
     cycles = values[: count * period].reshape(count, period)
-    rest: Vector = (cycles - np.mean(cycles, axis=0)).ravel()
-    return rest
+    return (cycles - np.mean(cycles, axis=0)).ravel()
 
 
 # ---- Two tunings ----
@@ -594,8 +590,7 @@ def _different_load(a: list[Measured], b: list[Measured], shared: _Batches) -> l
 def _moving_mean(values: Vector, window: int) -> Vector:
     middle = float(np.mean(values))
     total = np.cumsum(np.append(0.0, values - middle))
-    found: Vector = middle + (total[window:] - total[:-window]) / window
-    return found
+    return middle + (total[window:] - total[:-window]) / window
 
 
 def _own_batches(a: list[Vector], b: list[Vector], least: int) -> tuple[Vector, Vector] | None:

@@ -103,8 +103,7 @@ def place_poles(difference: Matrix, offsets: Vector) -> Vector:
         return np.full(size, np.nan)
     for offset in offsets / unit:
         vector = rate @ vector + offset * vector
-    gain: Vector = unit * np.real(vector)
-    return gain
+    return unit * np.real(vector)
 
 
 def sampled_zeros(difference: Matrix, zeros: Vector, dt: float) -> Vector:

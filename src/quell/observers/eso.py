@@ -576,8 +576,7 @@ class ESO:
             )
         size = np.linalg.norm(self.plant.S, axis=1)
         rows = (x / size).reshape(-1, self.order)
-        mapped: Vector = np.linalg.solve(self.plant.S / size[:, None], rows.T).T.reshape(x.shape)
-        return mapped
+        return np.linalg.solve(self.plant.S / size[:, None], rows.T).T.reshape(x.shape)
 
 
 def noise_gains(observer: ESO) -> Vector:

@@ -266,8 +266,7 @@ def corrected(P: Matrix, gain: Matrix, outputs: Matrix, noise: Vector) -> Matrix
 
 
 def _symmetric(P: Matrix) -> Matrix:
-    found: Matrix = 0.5 * (P + P.T)
-    return found
+    return 0.5 * (P + P.T)
 
 
 # ---- The extended model, sampled, in coordinates in which its entries are of similar size ----
@@ -335,8 +334,7 @@ def units_of(whole: Matrix, rows: Matrix, omega: float) -> Vector:
     for _ in range(4):
         rows = rows @ step
         effect = np.maximum(effect, np.max(np.abs(rows), axis=0))
-    units: Vector = np.where(effect > 0.0, scale / np.where(effect > 0.0, effect, 1.0), 1.0)
-    return units
+    return np.where(effect > 0.0, scale / np.where(effect > 0.0, effect, 1.0), 1.0)
 
 
 def speed_from_noise(
@@ -541,8 +539,7 @@ _SLOWEST = 1e-6
 
 def sets_of(outputs: int) -> NDArray[np.bool_]:
     """Return all sets (2^p, p) of measured outputs; bit j of a set's number is output j."""
-    found: NDArray[np.bool_] = (np.arange(2**outputs)[:, None] >> np.arange(outputs)) & 1 == 1
-    return found
+    return (np.arange(2**outputs)[:, None] >> np.arange(outputs)) & 1 == 1
 
 
 def _densities(name: str, value: Any, count: int, of: str, positive: bool = False) -> Vector:

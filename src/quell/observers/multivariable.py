@@ -321,8 +321,7 @@ class MultivariableESO:
         row = phase * 2**on.size + int(np.sum(2 ** np.flatnonzero(on)))
         gain = table.gains[row].reshape(size, on.size) / scale[:, None]
         phi = table.transition * scale[None, :] / scale[:, None]
-        found: Matrix = (np.eye(size) - gain @ (table.output * scale)) @ phi
-        return found
+        return (np.eye(size) - gain @ (table.output * scale)) @ phi
 
     @property
     def standard_deviations(self) -> Vector:

@@ -234,8 +234,7 @@ def _array(address: int, size: int) -> Any:
 
 def _numbers(address: int, size: int) -> list[float]:
     """Return the float64 numbers at an address, none of an empty array."""
-    found: list[float] = _array(address, size).tolist() if size else []
-    return found
+    return _array(address, size).tolist() if size else []
 
 
 def _advance(holder: int, x: int, states: int, u: float, w: int, inputs: int) -> None:

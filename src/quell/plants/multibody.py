@@ -301,8 +301,7 @@ class Craft(NonlinearPlant):
     def B0(self) -> Matrix:  # noqa: N802
         """The matrix from the thrusts to the angles near the horizontal, K/I [rad/s² per N]."""
         numbers: Any = self.parameters
-        found: Matrix = numbers["lever"] / numbers["inertia"][:, None]
-        return found
+        return numbers["lever"] / numbers["inertia"][:, None]
 
 
 def quadrotor_attitude(

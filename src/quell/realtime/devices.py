@@ -446,8 +446,7 @@ class TwinDevice:
     def read_channels(self) -> list[float]:
         """Return the channels of this sample."""
         rows = self._channels
-        found: list[float] = rows[min(int(self._handle.t[0]), len(rows) - 1)].tolist()
-        return found
+        return rows[min(int(self._handle.t[0]), len(rows) - 1)].tolist()
 
     def write(self, u: Any) -> None:
         """Apply u [u-unit] for a sample."""

@@ -179,8 +179,7 @@ def _from_zstd(data: bytes, most: int) -> bytes:
     zstandard = import_extra("zstandard", "telemetry", "reading a compressed MCAP file")
     try:
         with zstandard.ZstdDecompressor().stream_reader(data) as reader:
-            content: bytes = reader.read(most)
-            return content
+            return reader.read(most)
     except zstandard.ZstdError:
         raise _DamagedError from None
 
@@ -188,8 +187,7 @@ def _from_zstd(data: bytes, most: int) -> bytes:
 def _from_lz4(data: bytes, most: int) -> bytes:
     lz4 = import_extra("lz4.frame", "telemetry", "reading a compressed MCAP file")
     try:
-        content: bytes = lz4.LZ4FrameDecompressor().decompress(data, max_length=most)
-        return content
+        return lz4.LZ4FrameDecompressor().decompress(data, max_length=most)
     except (RuntimeError, EOFError):
         raise _DamagedError from None
 

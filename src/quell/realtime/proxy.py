@@ -403,8 +403,7 @@ class CompensatedDrive:
 
     @property
     def _supervisor(self) -> SupervisorState:
-        state: SupervisorState = self._controller.supervisor
-        return state
+        return self._controller.supervisor
 
     def close(self) -> None:
         """Set the drive's u to zero and release it."""

@@ -670,8 +670,7 @@ def check_one(run: Any, where: str) -> Trajectory:
             "be of one y and one u; .axis(name) of the record is one axis, and quell "
             "replay and quell b0 --axes take several"
         )
-    found: Trajectory = run
-    return found
+    return run
 
 
 def trajectory_of(header: Header, rows: Matrix, most: int = round(1e6 * files.MAX_SIZE)) -> Any:

@@ -82,8 +82,7 @@ def open_device(
 
 def listen(url: str) -> Listener:
     """Return the device's end of the wire with this URL, for a ``Rig``."""
-    found: Listener = _end(url, listening=True)(url)
-    return found
+    return _end(url, listening=True)(url)
 
 
 def _end(url: str, listening: bool) -> Any:

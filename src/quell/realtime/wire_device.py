@@ -127,8 +127,7 @@ class WireDevice:
 
         NaN for those that have not come for fifty samples.
         """
-        found: list[float] = self.handle.queue.shown.tolist()
-        return found
+        return self.handle.queue.shown.tolist()
 
     def write(self, u: Any) -> None:
         """Send u [u-unit], a number; to a device of several signals as many as it has (m,).

@@ -93,8 +93,7 @@ class Setup:
 
     def as_json(self) -> dict[str, Any]:
         """Return the file's tables for ``quell.files.write_json``; infinite numbers become None."""
-        tables: dict[str, Any] = nonfinite_to_none(self.tables())
-        return tables
+        return nonfinite_to_none(self.tables())
 
     def needed(self, table: str) -> Any:
         """Return the object of an optional table; raise a ``SetupError`` if it is missing."""

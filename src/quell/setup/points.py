@@ -161,8 +161,7 @@ class _Points:
         """Return the table of the plant at a point."""
         if self.parameters:
             values = dict(zip(self.parameters, at, strict=True))
-            found: Mapping[str, Any] = loading.changed(self.name, self.data, values)["plant"]
-            return found
+            return loading.changed(self.name, self.data, values)["plant"]
         return _merged(self.data.get("plant", {}), self.changes[at][1])
 
     def plant(self, *at: float) -> Any:

@@ -231,5 +231,4 @@ def schroeder_phases(amplitudes: Vector) -> Vector:
     """
     share = amplitudes**2 / max(float(np.sum(amplitudes**2)), np.finfo(float).tiny)
     delay = np.concatenate([[0.0], np.cumsum(share)[:-1]])
-    phases: Vector = np.mod(0.5 * math.pi - 2.0 * math.pi * np.cumsum(delay), 2.0 * math.pi)
-    return phases
+    return np.mod(0.5 * math.pi - 2.0 * math.pi * np.cumsum(delay), 2.0 * math.pi)

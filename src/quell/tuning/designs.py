@@ -336,8 +336,7 @@ def _worst(task: Task, solution: Solution) -> list[int]:
     """Return the plants with the worst objectives."""
     over = SetResponses(task.plants, task.inputs)
     each = scores(task.objective, solution.structure, solution.values, over)
-    found: list[int] = np.argsort(-each)[:_MEMBERS].tolist()
-    return found
+    return np.argsort(-each)[:_MEMBERS].tolist()
 
 
 def _near(task: Task, structure: Structure, start: Solution, rounds: int) -> Solution | None:

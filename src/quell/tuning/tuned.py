@@ -106,8 +106,7 @@ class Uncertain:
         """Return uniform values that the design did not have."""
         ends = self.ends
         draws = np.random.default_rng([seed, 1]).random((count, ends.shape[0]))
-        found: Matrix = ends[:, 0] + draws * (ends[:, 1] - ends[:, 0])
-        return found
+        return ends[:, 0] + draws * (ends[:, 1] - ends[:, 0])
 
 
 @dataclass(frozen=True)
@@ -515,7 +514,7 @@ class Tuned(InNotebook):
         details: dict[str, Any] = {}
         if self.details is not None:
             details = {**self.details.to_json(), "verdicts": self.verdicts()}
-        found: dict[str, Any] = nonfinite_to_none(
+        return nonfinite_to_none(
             {
                 "objective": self.objective,
                 "constraints": dict(vars(self.constraints)),
@@ -542,4 +541,3 @@ class Tuned(InNotebook):
                 **details,
             }
         )
-        return found

@@ -280,8 +280,7 @@ class Written:
         return max(self.steps, key=lambda step: abs(step[2]), default=None)
 
     def _of_axis(self, run: Any, name: str) -> Vector:
-        values: Vector = run[name] if self.axis is None else run[name][:, self.axis]
-        return values
+        return run[name] if self.axis is None else run[name][:, self.axis]
 
     def figures(self, controller: Any, run: Any) -> StepFigures | None:
         """Return what a run does after the largest step of the reference; None if it has none."""
@@ -332,8 +331,7 @@ class Written:
         return step._replace(overshoots=overshoots, settlings=_range(times)), None
 
     def _names(self, run: Any) -> Signals:
-        found: Signals = run.signals if self.axis is None else run.axis(self.axis).signals
-        return found
+        return run.signals if self.axis is None else run.axis(self.axis).signals
 
     def along(self, run: Any) -> MoveFigures:
         """Return how far a run is from its reference."""
@@ -353,8 +351,7 @@ class Written:
         """Return the scenario up to a time [s], without starts from rest after that."""
         rests = [time for time in np.ravel(self.scenario.rest_at) if time < scenario_end]
         last = min(scenario_end, self.scenario.duration)
-        found: Scenario = replace(self.scenario, duration=last, rest_at=tuple(rests))
-        return found
+        return replace(self.scenario, duration=last, rest_at=tuple(rests))
 
     def stepping(self, size: float, last: float, before: int) -> Written:
         """Return the same loop with a step of the reference alone, for a scenario without one.

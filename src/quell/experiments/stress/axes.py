@@ -289,8 +289,7 @@ class Arm:
 
     def inertia(self, elbow: float) -> Matrix:
         """Return M at q_2 = ``elbow`` [kg m²]."""
-        found: Matrix = self.plant.mass_matrix([0.0, elbow])
-        return found
+        return self.plant.mass_matrix([0.0, elbow])
 
     @property
     def b0(self) -> Vector:

@@ -250,8 +250,7 @@ def _at_own_limits(u: Any, limits: Any) -> NDArray[np.bool_]:
     """Return where each actuator has the value or the change of a limit (samples, actuators)."""
     room, du = _ROUNDED * np.max(np.abs(u), axis=0), np.diff(u, axis=0, prepend=u[:1])
     ends = (u, limits.low), (u, limits.high), (du, limits.most_change), (du, limits.least_change)
-    found: NDArray[np.bool_] = np.any([np.abs(each - end) <= room for each, end in ends], axis=0)
-    return found
+    return np.any([np.abs(each - end) <= room for each, end in ends], axis=0)
 
 
 def _signals_of(controller: Any) -> list[tuple[str, tuple[str, int]]]:

@@ -142,8 +142,7 @@ class Expressions:
         method = getattr(self, f"_{type(node).__name__.lower()}", None)
         if method is None:
             raise self.fail(node, f"the translation to C has no {type(node).__name__}")
-        found: Value = method(node)
-        return found
+        return method(node)
 
     def constant(self, value: Any) -> Value:
         """Return a number that is known now."""
@@ -230,8 +229,7 @@ class Expressions:
     def _subscript(self, node: ast.Subscript) -> Value:
         base = self.translate(node.value)
         if isinstance(base.kind, Several):
-            found: Value = base.items[self.translate(node.slice).constant]
-            return found
+            return base.items[self.translate(node.slice).constant]
         if isinstance(base.kind, Struct):
             if base.kind.python is tuple:
                 return self.program.structs.entry(base, self.translate(node.slice).constant)

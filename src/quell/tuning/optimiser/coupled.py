@@ -168,8 +168,7 @@ class CoupledLoops:
             near = frequencies(resonant, self.dt)
             beside = np.abs(near[:, None] / resonant.imag[None, :] - 1.0) < 0.2
             parts.append(near[np.any(beside, axis=1)])
-        found: Vector = np.unique(np.concatenate(parts))
-        return found
+        return np.unique(np.concatenate(parts))
 
     def _responses(self, plant: Plant) -> Complex:
         m, p = plant.B.shape[1], plant.C.shape[0]
@@ -267,8 +266,7 @@ def _scaled_norm(M: Complex) -> NDArray[np.float64]:
     a, b, c, d = M[..., 0, 0], M[..., 0, 1], M[..., 1, 0], M[..., 1, 1]
     power = np.abs(a) ** 2 + np.abs(d) ** 2 + 2.0 * np.abs(b * c)
     root = np.sqrt(np.maximum(power**2 - 4.0 * np.abs(a * d - b * c) ** 2, 0.0))
-    found: NDArray[np.float64] = np.sqrt(0.5 * (power + root))
-    return found
+    return np.sqrt(0.5 * (power + root))
 
 
 def closed(plant: Plant, laws: Sequence[LinearLaw]) -> Matrix:

@@ -128,13 +128,11 @@ class PlantSet:
         """Return P (J, k)."""
         rows, count = np.arange(len(self._responses)), omega.size
         found = self._set(np.tile(omega, rows.size), np.repeat(rows, count), self.dt)
-        P: Complex = found.reshape(-1, count)[self._of_set] * self.factors[:, None]
-        return P
+        return found.reshape(-1, count)[self._of_set] * self.factors[:, None]
 
     def responses_of(self, omega: Vector, members: NDArray[np.intp]) -> Complex:
         """Return P (k,) at frequencies (k,), each of the plant with that number."""
-        P: Complex = self._set(omega, self._of_set[members], self.dt) * self.factors[members]
-        return P
+        return self._set(omega, self._of_set[members], self.dt) * self.factors[members]
 
     @cached_property
     def resonant(self) -> bool:
@@ -166,8 +164,7 @@ class PlantSet:
     def s_poles(self, plant: SampledPlant) -> Complex:
         """Return the poles of a plant of the set [rad/s], but for those at z = 0."""
         poles = in_s_plane(self._poles[id(plant)], self.dt)
-        kept: Complex = poles[np.isfinite(poles)]
-        return kept
+        return poles[np.isfinite(poles)]
 
     def _crossover(self) -> float:
         top = math.pi / self.dt
@@ -201,8 +198,7 @@ class PlantSet:
                 near = frequencies(resonant, self.dt)
                 parts.append(near[_beside(near, resonant)])
         grid = np.unique(np.concatenate(parts))
-        kept: Vector = grid[(grid >= bottom) & (grid <= top)]
-        return kept
+        return grid[(grid >= bottom) & (grid <= top)]
 
     def _end_of_peaks(self, top: float) -> float:
         """Return the frequency above which all plants' gain is small [rad/s]."""
@@ -335,8 +331,7 @@ def dead_samples(plant: SampledPlant) -> int:
 def _beside(omega: Vector, poles: Complex) -> NDArray[np.bool_]:
     """Return which frequencies lie within a fifth of a resonance."""
     distance = np.abs(omega[:, None] / poles.imag[None, :] - 1.0)
-    near: NDArray[np.bool_] = np.any(distance < 0.2, axis=1)
-    return near
+    return np.any(distance < 0.2, axis=1)
 
 
 # ---- The linear law of a controller in closed form, quick enough for each step of a search ----

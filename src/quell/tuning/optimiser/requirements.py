@@ -149,15 +149,13 @@ def counted_of(
 
 
 def _damping(s: Complex) -> Vector:
-    damping: Vector = -s.real / np.abs(s)
-    return damping
+    return -s.real / np.abs(s)
 
 
 def _upper(s: Complex) -> Complex:
     """Return the poles in the upper half plane, without the real ones."""
     s = s[np.isfinite(s)]
-    kept: Complex = s[s.imag > _REAL * np.abs(s)]
-    return kept
+    return s[s.imag > _REAL * np.abs(s)]
 
 
 def beside_poles(plants: loops.PlantSet, poles: list[Complex]) -> Vector:
@@ -169,8 +167,7 @@ def beside_poles(plants: loops.PlantSet, poles: list[Complex]) -> Vector:
     width = np.maximum(np.abs(s.real), 1e-7 * s.imag)
     near = np.ravel(s.imag[:, None] + width[:, None] * _BESIDE)
     near = near[(near > plants.omega[0]) & (near < plants.omega[-1])]
-    kept: Vector = np.setdiff1d(near, plants.omega)
-    return kept
+    return np.setdiff1d(near, plants.omega)
 
 
 class Followed:

@@ -206,8 +206,7 @@ def delay_margin(plants: PlantSet, structure: Structure, values: Matrix) -> Vect
 
 
 def _loop(plants: PlantSet, structure: Structure, row: Vector, j: int, omega: Vector) -> Complex:
-    L: Complex = plants.responses(omega)[j] * structure.response(row[None, :], omega)[0]
-    return L
+    return plants.responses(omega)[j] * structure.response(row[None, :], omega)[0]
 
 
 def _limit_of_u(name: str, limit: float, over: SetResponses) -> Extra:

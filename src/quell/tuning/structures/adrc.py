@@ -155,8 +155,7 @@ class Designs:
         slope = np.eye(v.shape[1]) - self.delay * self.closing
         inner = np.einsum("mi,mij,mj->m", w, slope, v)
         through = np.sum(self.law * v, axis=1) * np.sum(w * self.gain, axis=1)
-        gain: Vector = through / inner / self.dt
-        return gain
+        return through / inner / self.dt
 
 
 def designs(
@@ -240,8 +239,7 @@ def feedback(found: Designs, omega: Vector) -> Complex:
         return _feedback_by_innovation(found, omega)
     matrix, z = _matrices(found, omega)
     solved = np.linalg.solve(matrix, found.gain[:, None, :, None])[..., 0]
-    product: Complex = np.einsum("mkn,mn->mk", solved, found.law) * z
-    return product
+    return np.einsum("mkn,mn->mk", solved, found.law) * z
 
 
 def _feedback_by_innovation(found: Designs, omega: Vector) -> Complex:
@@ -258,8 +256,7 @@ def _feedback_by_innovation(found: Designs, omega: Vector) -> Complex:
     given_x = np.broadcast_to(given[:, None, :n, None], (count, omega.size, n, 1))
     W[:, :, :n] = np.linalg.solve(matrix, given_x)[..., 0]
     corrected = np.einsum("mki,mi->mk", W + found.gain[:, None, :], found.law)
-    response: Complex = corrected / (1.0 + W[:, :, 0])
-    return response
+    return corrected / (1.0 + W[:, :, 0])
 
 
 def _matrices(found: Designs, omega: Vector) -> tuple[Complex, Complex]:
@@ -278,8 +275,7 @@ def _matrices(found: Designs, omega: Vector) -> tuple[Complex, Complex]:
 
 def _diagonals(matrix: NDArray[Any]) -> NDArray[Any]:
     """Return the diagonals (m, k, N) of matrices (m, k, N, N), to read or to write."""
-    found: NDArray[Any] = np.einsum("mkii->mki", matrix)
-    return found
+    return np.einsum("mkii->mki", matrix)
 
 
 def unstable_poles(found: Designs) -> Vector:
@@ -302,8 +298,7 @@ def unstable_poles(found: Designs) -> Vector:
     omega = np.unique(np.concatenate([np.geomspace(1e-5 * top, top, 200), even]))
     angle = np.angle(np.linalg.det(_matrices(found, omega)[0]))
     steps = np.remainder(np.diff(angle, axis=1) + np.pi, 2.0 * np.pi) - np.pi
-    count: Vector = np.maximum(np.round(size - 0.5 - np.sum(steps, axis=1) / np.pi), 0.0)
-    return count
+    return np.maximum(np.round(size - 0.5 - np.sum(steps, axis=1) / np.pi), 0.0)
 
 
 # ---- ADRC by bandwidths, with poles of its own, at half gain, of reduced order, with a model ----
@@ -617,14 +612,12 @@ class AdrcStructure:
         """Return C_y (m, k)."""
         found, of_row = self._designs(values)
         factor = self.model.sign * found.factor[of_row] / values[:, 0]
-        response: Complex = factor[:, None] * feedback(found, omega)[of_row]
-        return response
+        return factor[:, None] * feedback(found, omega)[of_row]
 
     def integral_gain(self, values: Matrix) -> Vector:
         """Return k_i (m,)."""
         found, of_row = self._designs(values)
-        gain: Vector = (found.integral_gain * found.factor)[of_row] / values[:, 0]
-        return gain
+        return (found.integral_gain * found.factor)[of_row] / values[:, 0]
 
     def unstable_poles(self, values: Matrix) -> Vector:
         """Return how many poles of C_y are unstable (m,)."""

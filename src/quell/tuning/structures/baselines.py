@@ -144,13 +144,11 @@ class FilteredPID:
         kp, ki, kd, f1, f2 = (part[:, None] for part in self.parts(values))
         # At half the sampling rate s is infinite: the frequencies of the search stay just below.
         s = 2j / self.model.dt * np.tan(0.5 * self.model.dt * omega)[None, :]
-        found: Complex = self.model.sign * (kp + ki / s + kd * s) / (1.0 + f1 * s + f2 * s**2)
-        return found
+        return self.model.sign * (kp + ki / s + kd * s) / (1.0 + f1 * s + f2 * s**2)
 
     def integral_gain(self, values: Matrix) -> Vector:
         """Return K/T_i."""
-        found: Vector = values[:, 0] / values[:, 1]
-        return found
+        return values[:, 0] / values[:, 1]
 
     def unstable_poles(self, values: Matrix) -> Vector:
         """Return zeros: filters are stable."""
@@ -272,13 +270,11 @@ class CascadeStructure:
             centre, depth, width = (values[:, i + j, None] for j in range(3))
             w = 2.0 / dt * np.tan(0.5 * dt * math.tau * centre)
             C = C * (s**2 + depth * width * w * s + w**2) / (s**2 + width * w * s + w**2)
-        found: Complex = C
-        return found
+        return C
 
     def integral_gain(self, values: Matrix) -> Vector:
         """Return K_p K_v/T_n."""
-        found: Vector = values[:, 0] * values[:, 1] / values[:, 2]
-        return found
+        return values[:, 0] * values[:, 1] / values[:, 2]
 
     def unstable_poles(self, values: Matrix) -> Vector:
         """Return zeros: filters are stable."""
@@ -400,13 +396,11 @@ class LqgStructure:
     def response(self, values: Matrix, omega: Vector) -> Complex:
         """Return C_y (m, k)."""
         rows = [law.response(omega, self.model.dt) for law in self._laws(values)]
-        found: Complex = np.array(rows) / values[:, :1]
-        return found
+        return np.array(rows) / values[:, :1]
 
     def integral_gain(self, values: Matrix) -> Vector:
         """Return k_i (m,)."""
-        found: Vector = np.array([law.integral_gain for law in self._laws(values)]) / values[:, 0]
-        return found
+        return np.array([law.integral_gain for law in self._laws(values)]) / values[:, 0]
 
     def unstable_poles(self, values: Matrix) -> Vector:
         """Return the number of unstable poles of C_y (m,)."""
