@@ -4,7 +4,7 @@ With ``S = 1/(1 + L)``, ``T = 1 − S`` and the controller C_y from −y to u, t
 Åström & Hägglund (*Advanced PID Control*, ISA 2006, section 4.6): ``M_s = max |S|``, ``M_t = max
 |T|``, ``M_ks = max |C_y S|``, over the frequencies up to half the sampling rate.
 
-A load w at the plant's input whose power at the frequencies ω_i is W_i leaves, late in a run,
+A load w at the plant's input whose power at the frequencies ω_i is W_i leaves, late in a run::
 
     E[y²] = ∫ |G_yd(jω)|² W(ω) dω = Σ_i |P(jω_i)/(1 + P(jω_i) C_y(jω_i))|² W_i
 
