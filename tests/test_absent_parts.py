@@ -84,7 +84,7 @@ def test_a_part_that_is_absent_is_not_called(has: str | None) -> None:
     ("options", "most", "files"),
     [
         ({}, 20, 6),
-        ({"learner": ql.learners.Kalman(), "guard": ql.Guard()}, 86, 10),
+        ({"learner": ql.learners.Kalman(), "guard": ql.Guard()}, 88, 10),
     ],
 )
 def test_a_sample_is_short_to_follow(options: dict[str, Any], most: int, files: int) -> None:

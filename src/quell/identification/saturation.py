@@ -76,7 +76,7 @@ def standing(x: Vector, resolution: float, u: Vector | None = None) -> Standing:
     """Return where a signal stands at its limits; ``resolution`` is the step it is rounded to.
 
     A y that does not answer a ``u`` that moves stands at its limit, at begin and end, too, and so
-    does one that is constant there, and noisy elsewhere: noise does not rest.
+    does one that is constant there while u moves, and noisy elsewhere: noise does not rest.
     """
     none = np.zeros(x.size, dtype=bool)
     if np.unique(x).size <= _VALUES:
@@ -106,8 +106,9 @@ def _at_top(x: Vector, resolution: float, u: Vector | None) -> NDArray[np.bool_]
                 float(np.sum(np.abs(np.diff(part)))) if top - x[k] > _LEAVES * resolution else 0.0
                 for part, k in zip(ends, (away[0], away[-1]), strict=True)
             )
-            enough = moved > _SWINGS * float(np.ptp(u)) or (resolution == 0.0 and _is_noisy(x[~at]))
-            if enough and np.sum(every) >= _FEWEST:
+            unmoved = moved > _SWINGS * float(np.ptp(u))
+            still = moved > 0.0 and resolution == 0.0 and _is_noisy(x[~at])
+            if (unmoved or still) and np.sum(every) >= _FEWEST:
                 return every
         at[: away[0]] = at[away[-1] :] = False
     count = int(np.sum(at))
