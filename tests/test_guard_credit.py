@@ -227,8 +227,9 @@ def test_averages_are_those_of_the_formula(rng: np.random.Generator) -> None:
         explained = lag_push(design.lag, disturbance, 0, said)
         f, said = explained if k >= 1300 else f, g
         f *= 100.0 if k % 50 == 20 else 0.01 if 60 <= k < 70 else 1.0
-        q, p = f - memory.filtered[0], memory.filtered[2]
+        q = f - memory.filtered[0]
         assess(design, memory, f)
+        p = memory.filtered[2]
         assert memory.sample[0].own_peak == pytest.approx(own, rel=1e-9)
         large = abs(q) if (k + 1) * forget < 1.0 else min(abs(q), 5.0 * peak)
         peak += rise * (large - peak) if large > peak else -decay * peak

@@ -334,7 +334,7 @@ def test_other_limits_give_what_a_tuning_with_them_gives() -> None:
     text = found.summary()
     assert text.startswith("constraints: M_s ≤ 1.6, M_t ≤ 1.6, M_ks ≤ 3, damping ≥ 0.4, |p| dt ≤")
     assert f"M_ks 2.7: k_i {rows[min(rows)]:.4g}" in text
-    assert f"pi: k_i {found.design.k_i:.4g}; IAE " in text
+    assert f"pi: k_i {found.design.k_i:.4g}, IAE " in text
     assert repr(found) == f"Tuned pi:\n{text}"
 
 
