@@ -375,6 +375,30 @@ def test_the_margins_of_axes_with_the_true_b0_are_those_of_one_axis() -> None:
     assert loop.channel_margins("u2").delay == pytest.approx(single.delay, rel=1e-6)
 
 
+@pytest.mark.parametrize("b0", [2.0, -0.02])
+def test_what_an_axis_has_learned_of_itself_is_in_its_margins(b0: float) -> None:
+    """M_s is that of one controller that has learned the same, and not that of a new one."""
+    A, B, C = np.array([[0.0, 1.0], [-40.0, -3.0]]), np.array([[0.0], [1.2 * b0]]), np.eye(2)[:1]
+    Ad, (Bd,) = zero_order_hold(A, [B], 2e-3)
+
+    def made() -> ql.ADRC:
+        observer = ql.ESO.model_free(2, b0, 50.0, 2e-3)
+        return ql.ADRC(observer, 10.0, learner=ql.learners.RLS())
+
+    one, machine = made(), ql.Axes([made()])
+    x, z = np.zeros(2), np.zeros(2)
+    with as_python():
+        for k in range(500):
+            r = float(np.sin(0.006 * k) + 0.3 * np.sin(0.014 * k))
+            x = Ad @ x + Bd.ravel() * one.step(r, float(x[0]))
+            z = Ad @ z + Bd.ravel() * machine.step([r], z[:1])[0]
+    learned = analysis.analyse((A, B, C), machine).m_s("inputs").value
+    alone = analysis.analyse((A, B, C), one).margins.modulus
+    new = analysis.analyse((A, B, C), ql.Axes([made()])).m_s("inputs").value
+    assert learned == pytest.approx(1.0 / alone, rel=1e-6)
+    assert abs(learned - new) > 0.01
+
+
 @pytest.mark.trial
 @pytest.mark.compiled
 def test_an_arm_is_linearised_at_its_pose_and_b0_taken_there() -> None:

@@ -169,8 +169,9 @@ def law_of_axes(axes: Axes, x: Any = None, noise_hides: bool = False) -> MatrixL
     for a drive without a linear law.
     """
     B0, inverse = gain_at(axes, x)
-    learners = [within_noise(axis) if noise_hides else None for axis in axes.unit_axes]
-    laws = [linear_law(axis, at) for axis, at in zip(axes.unit_axes, learners, strict=True)]
+    learners = [within_noise(axis) if noise_hides else None for axis in axes.axes]
+    found = (linear_law(axis, at) for axis, at in zip(axes.axes, learners, strict=True))
+    laws = [_asking(law, b0, axes.compensates) for law, b0 in zip(found, axes.b0, strict=True)]
     law = joined(laws, inverse)
     if not axes.compensates:
         return law
@@ -179,6 +180,12 @@ def law_of_axes(axes: Axes, x: Any = None, noise_hides: bool = False) -> MatrixL
     passes = np.eye(B0.shape[1]) - inverse @ B0
     law = law._replace(B_r=law.B_r @ B0, D_r=law.D_r @ B0 + passes)
     return _behind(_law_of_drives(axes), law) if axes.drives else law
+
+
+def _asking(law: LinearLaw, b0: float, compensates: bool) -> LinearLaw:
+    """Return a law of u that asks for ``v = b0 u``; the reference of a compensator is in v, too."""
+    asked = law._replace(C=b0 * law.C, D_r=b0 * law.D_r, D_y=b0 * law.D_y, B_u=law.B_u / b0)
+    return asked._replace(B_r=law.B_r / b0, D_r=law.D_r) if compensates else asked
 
 
 def _law_of_drives(axes: Axes) -> MatrixLaw:

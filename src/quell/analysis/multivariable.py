@@ -498,7 +498,7 @@ def analyse_axes(plant: Any, axes: Axes, operating_point: Any = None) -> Multiva
     lines += about_learning(learners, gain_ratios(plant, axes, operating_point))
     gated = [
         f"{type(axis.learner).__name__} of {name}"
-        for name, axis in zip(axes.names, axes.unit_axes, strict=True)
+        for name, axis in zip(axes.names, axes.axes, strict=True)
         if within_noise(axis) is not None
     ]
     if gated:
