@@ -113,18 +113,23 @@ class Driven:
 
     def __init__(self, path: Path, folder: Path) -> None:
         import fmpy
-        from fmpy.fmi3 import FMU3Slave
 
         self.description = fmpy.read_model_description(str(path))
         self.references = {v.name: v.valueReference for v in self.description.modelVariables}
         self.messages: list[str] = []
-        self.fmu = FMU3Slave(
+        self.fmu = self.kind()(
             guid=self.description.guid,
             unzipDirectory=fmpy.extract(str(path), str(folder)),
             modelIdentifier=self.description.coSimulation.modelIdentifier,
             instanceName="driven",
         )
         self.instantiate()
+
+    def kind(self) -> Any:
+        """Return the class of FMPy that calls such FMUs."""
+        from fmpy.fmi3 import FMU3Slave
+
+        return FMU3Slave
 
     def instantiate(self) -> None:
         """Make the instance, which has not begun its initialisation."""
@@ -175,19 +180,11 @@ class Driven:
 class DrivenOlder(Driven):
     """The same of an FMU of FMI 2.0."""
 
-    def __init__(self, path: Path, folder: Path) -> None:
-        import fmpy
+    def kind(self) -> Any:
+        """Return the class of FMPy that calls such FMUs."""
         from fmpy.fmi2 import FMU2Slave
 
-        self.description = fmpy.read_model_description(str(path))
-        self.references = {v.name: v.valueReference for v in self.description.modelVariables}
-        self.fmu = FMU2Slave(
-            guid=self.description.guid,
-            unzipDirectory=fmpy.extract(str(path), str(folder)),
-            modelIdentifier=self.description.coSimulation.modelIdentifier,
-            instanceName="driven",
-        )
-        self.instantiate()
+        return FMU2Slave
 
     def instantiate(self) -> None:
         """Make the instance, which has not begun its initialisation."""

@@ -106,9 +106,9 @@ def _at_top(x: Vector, resolution: float, u: Vector | None) -> NDArray[np.bool_]
                 float(np.sum(np.abs(np.diff(part)))) if top - x[k] > _LEAVES * resolution else 0.0
                 for part, k in zip(ends, (away[0], away[-1]), strict=True)
             )
-            unmoved = moved > _SWINGS * float(np.ptp(u))
+            unanswered = moved > _SWINGS * float(np.ptp(u))
             still = moved > 0.0 and resolution == 0.0 and _is_noisy(x[~at])
-            if (unmoved or still) and np.sum(every) >= _FEWEST:
+            if (unanswered or still) and np.sum(every) >= _FEWEST:
                 return every
         at[: away[0]] = at[away[-1] :] = False
     count = int(np.sum(at))

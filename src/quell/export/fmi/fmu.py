@@ -112,12 +112,7 @@ def model_description(
         canGetAndSetFMUState="true",
         canSerializeFMUState="true",
     )
-    units = _add(root, "UnitDefinitions")
-    for unit, powers in _UNITS.items():
-        _add(_add(units, "Unit", name=unit), "BaseUnit", **powers)
-    categories = _add(root, "LogCategories")
-    _add(categories, "Category", name="error", description="reasons of fmi3Error")
-    _add(root, "DefaultExperiment", startTime="0", stepSize=number(dt))
+    _add_settings(root, "fmi3Error", dt)
     elements = _add(root, "ModelVariables")
     for reference, variable in enumerate(variables):
         _add_variable(elements, reference, variable)
@@ -163,12 +158,7 @@ def older_description(
     sources = _add(slave, "SourceFiles")
     for file in files:
         _add(sources, "File", name=file)
-    units = _add(root, "UnitDefinitions")
-    for unit, powers in _UNITS.items():
-        _add(_add(units, "Unit", name=unit), "BaseUnit", **powers)
-    categories = _add(root, "LogCategories")
-    _add(categories, "Category", name="error", description="reasons of fmi2Error")
-    _add(root, "DefaultExperiment", startTime="0", stepSize=number(dt))
+    _add_settings(root, "fmi2Error", dt)
     elements = _add(root, "ModelVariables")
     for reference, variable in enumerate(variables):
         attributes, value = _attributes(reference, variable)
@@ -181,6 +171,16 @@ def older_description(
             _add(outputs, "Unknown", index=str(place_), dependencies="")
             _add(unknowns, "Unknown", index=str(place_))
     return _text(root)
+
+
+def _add_settings(root: ElementTree.Element, error: str, dt: float) -> None:
+    """Add units, the category of messages, and the step, which both versions write alike."""
+    units = _add(root, "UnitDefinitions")
+    for unit, powers in _UNITS.items():
+        _add(_add(units, "Unit", name=unit), "BaseUnit", **powers)
+    categories = _add(root, "LogCategories")
+    _add(categories, "Category", name="error", description=f"reasons of {error}")
+    _add(root, "DefaultExperiment", startTime="0", stepSize=number(dt))
 
 
 def build_description(name: str, files: Sequence[str]) -> bytes:
